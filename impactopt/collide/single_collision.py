@@ -16,6 +16,7 @@ from impactopt.collide.contact_states import ContactStates, States
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.sdc import frozen_model
+from impactopt.contact.friction import tangential_outcome
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_choice
 from impactopt.files.record import Record, load_record, plain, replay_name
@@ -357,6 +358,8 @@ def collide_once(
     available = {name: m for name, m in MEASURES.items() if all(found[o] is not None for o in m.outputs)}
     numbers = {name: float(measure.of(batch)[0]) for name, measure in available.items()}
     target = model.target.with_units(collision.target_result.values())
+    if collision.tangential_velocity is not None:
+        target |= tangential_outcome(collision.tangential_velocity)
     found = {**head, **numbers, "target": target, "joints": _joints(collision, robot, limit)}
     found |= {"caution": collision.caution} if collision.caution else {}
     return plain(found | ({} if record is None else _saved(file, section, record)))

@@ -39,6 +39,7 @@ def joint_space_model(
         error="step_error" in outputs,
         second_integrals="configuration" in outputs or freezes > 0,
         slides=collision.contact_friction is not None,
+        moves_target=collision.moves_target,
         refrozen=freezes > 0,
         horizon=collision.horizon,
     )

@@ -34,6 +34,8 @@ class Collision:
     velocity : (nv) Pinocchio's v after the collision.
     configuration : (nq) Pinocchio's q after the collision.
     target_result : results of the target at separation, by the names in its `results`.
+    tangential_velocity : (3) [m/s] of a target that friction moves, across the normal at separation; else
+        None.
     time : (k) [s] since contact.
     force : (k) [N] on the target along the normal.
     penetration : (k) [m] of the contact law.
@@ -74,6 +76,7 @@ class Collision:
     hand_wrench: Array | None = None
     ground_wrench: Array | None = None
     zmp: Array | None = None
+    tangential_velocity: Array | None = None
     freeze_error: float = np.nan
     caution: str = ""
 

@@ -56,6 +56,8 @@ class JointSpaceModel:
     error : the state has `left_out`.
     second_integrals : the state has torque2 and impulse2.
     slides : state and data have friction at the striking point.
+    moves_target : the friction moves the target across the normal. Its velocity there is that at the freeze,
+        and the integral of the friction over its mass.
     refrozen : there are several freezes. Then the data have `velocity_before` (n), the change of the joint
         velocity from contact to the freeze, and `until` [s], the end of the freeze.
     horizon : [s] end of the integration; with several freezes it is in `until`.
@@ -71,6 +73,7 @@ class JointSpaceModel:
     error: bool = False
     second_integrals: bool = False
     slides: bool = False
+    moves_target: bool = False
     refrozen: bool = False
     horizon: float = np.inf
 
@@ -160,6 +163,10 @@ class JointSpaceModel:
     def target_numbers(self, data: dict[str, Any]) -> dict[str, Any]:
         return {name: data[f"target_{name}"] for name in self.target.parameters}
 
+    def tangential_change(self, y: Any, data: dict[str, Any]) -> Any:
+        """Change (3) of the target's velocity across the normal since the freeze [m/s]."""
+        return self.part(y, "sliding") / self.target.tangential_mass(self.target_numbers(data))
+
     # ------------------------------------------------------------ quantities at the instants of y's columns
     def velocity_change(self, y: Any, data: dict[str, Any]) -> Any:
         """Joint velocities relative to the servo's reference (n) [rad/s]: integral of eq. (9).
@@ -201,11 +208,13 @@ class JointSpaceModel:
         return w + data["e"] * self.part(y, "time") if "e" in data else w
 
     def point_velocity(self, y: Any, data: dict[str, Any]) -> Any:
-        """Velocity of the striking point (3) [m/s]. Linear in y."""
+        """Velocity of the striking point (3) [m/s], across the normal against the target. Linear in y."""
         pushed = ca.mtimes(data["normal"], self.part(y, "impulse")) + self.part(y, "sliding")
         velocity = _spread(data["point_velocity"], pushed) - ca.mtimes(data["m_point"], pushed)
         if self.n:
             velocity += ca.mtimes(data["s_point"].T, self.part(y, "torque"))
+        if self.moves_target:
+            velocity -= self.tangential_change(y, data)
         return velocity + ca.mtimes(data["e_point"], self.part(y, "time")) if "e_point" in data else velocity
 
     def friction_on_target(
@@ -333,6 +342,7 @@ class Segment:
 
     Attributes
     ----------
+    tangential : (3) [m/s] velocity across the normal, at its end, of a target that friction moves.
     data : of the model, and the requested outputs of FrozenDynamics.
     since : [s] from contact to the segment's start.
     final : state at its end.
@@ -346,6 +356,7 @@ class Segment:
     states: Any
     v_after: Callable[[], Any]
     q_after: Callable[[], Any]
+    tangential: Any = None
 
 
 def relative_to(settings: Mapping[str, Any], time: Any, data: dict[str, Any]) -> dict[str, Any]:
@@ -441,6 +452,9 @@ class SegmentedCollision:
             data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
             if self.model.slides:
                 data["point_velocity"] = self.frozen.velocity_of_point(q, v, inputs["normal"])
+            before = segments[-1].tangential if segments else 0.0
+            if self.model.moves_target:
+                data["point_velocity"] -= before
             data["velocity_before"] = (v - inputs["v"])[-n:]
             if "reference" in inputs:
                 data["reference_before"] = _gained(inputs, duration * a)
@@ -449,7 +463,7 @@ class SegmentedCollision:
             length = self.horizon - duration * a if last else duration * (b - a)
             data["until"] = ca.if_else(contact, length, -1.0)
             begin = (start, 1.0 if last else b - a, duration * a)
-            segments.append(self._segment(data, frozen_at, q, v, *begin, record=record))
+            segments.append(self._segment(data, frozen_at, q, v, *begin, record=record, tangential=before))
             reached = segments[-1].final
             start = self._next_start(reached)
             # once separated, always: bodies that meet again are not in this model
@@ -470,8 +484,10 @@ class SegmentedCollision:
         since: Any,
         *,
         record: bool,
+        tangential: Any = 0.0,
     ) -> Segment:
         final, states = self._loop(data, start, fraction, record=record)
+        moves = self.model.moves_target
         return Segment(
             data=data,
             since=since,
@@ -479,6 +495,7 @@ class SegmentedCollision:
             states=states,
             v_after=lambda: v + self._change(data, frozen_at, final),
             q_after=lambda: self._moved(data, frozen_at, q, v, final)[0],
+            tangential=tangential + self.model.tangential_change(final, data) if moves else None,
         )
 
     def _loop(

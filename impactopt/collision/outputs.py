@@ -22,6 +22,7 @@ OUTPUTS = {
     "velocity": "(nv) after the collision, Pinocchio's v",
     "configuration": "(nq) after the collision, Pinocchio's q",
     "target_result": "the target's `results` at separation",
+    "tangential_velocity": "(3) [m/s] across the normal after the collision, of a target that friction moves",
     "time": "(k) [s] since contact",
     "force": "(k) [N] on the target along the normal",
     "penetration": "(k) [m] of the contact law",
@@ -136,7 +137,16 @@ class Outputs:
     def energy(self) -> Any:
         ends = (self._last.final, ca.DM(self._model.start()))
         energies = [self._model.target.energy(*self._target(y)) for y in ends]
-        return ca.MX(energies[0] - energies[1])
+        gained = ca.MX(energies[0] - energies[1])
+        if not self._model.moves_target:
+            return gained
+        _, numbers = self._target(self._last.final)
+        mass = self._model.target.tangential_mass(numbers)
+        return gained + mass / 2 * ca.sumsqr(self.tangential_velocity)
+
+    @property
+    def tangential_velocity(self) -> Any:
+        return self._last.tangential
 
     @cached_property
     def target_result(self) -> Any:

@@ -17,7 +17,7 @@ from impactopt.collision.interface import CollisionModel
 from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS
 from impactopt.collision.settings import Effects, JointFriction, Settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
-from impactopt.contact.friction import check_friction
+from impactopt.contact.friction import check_friction, moves_target
 from impactopt.errors import InputError, check_array, check_choice, check_positive
 
 
@@ -180,7 +180,7 @@ class SteppedModel(CollisionModel):
         super().__post_init__()
         if self.method is not None:
             check_choice("method", self.method, STEPS)
-        check_friction("contact_friction", self.contact_friction)
+        check_friction("contact_friction", self.contact_friction, self.target)
         if self.contact_friction is not None and self.method == "implicit":
             raise InputError("method 'implicit': its steps have no contact_friction; give 'rk4', or none")
         if not 1e-14 <= check_array("tolerance", self.tolerance, ()) <= 1e-2:
@@ -212,6 +212,11 @@ class SteppedModel(CollisionModel):
     def n_freezes(self) -> int:
         """Number of further freezes, besides the one at contact."""
         return 0
+
+    @property
+    def moves_target(self) -> bool:
+        """True if friction moves the target across the normal."""
+        return moves_target(self.contact_friction)
 
     @property
     def stepping(self) -> str:
@@ -256,6 +261,8 @@ class SteppedModel(CollisionModel):
             missing.add("hand_wrench")
         if not self.target.results:
             missing.add("target_result")
+        if not self.moves_target:
+            missing.add("tangential_velocity")
         if self.stepping == "implicit":
             missing.add("step_error")
         return tuple(name for name in OUTPUTS if name not in missing)
@@ -271,7 +278,8 @@ class SteppedModel(CollisionModel):
         shapes = tuple((name, value.shape) for name, value in self.settings.items())
         frame = self.robot.striker(self.striker).model_frame
         steps = (self.stepping, self.step_length, self.tolerance, self.step_of_graph)
-        integration = (*steps, self.horizon, self.n_freezes, self.contact_friction is not None)
+        rubs = (self.contact_friction is not None, *(("moves",) if self.moves_target else ()))
+        integration = (*steps, self.horizon, self.n_freezes, *rubs)
         dynamics = model_hash(self.robot.model, self.robot.springs)
         return (dynamics, self.n_servos, frame, *held_by, *contact, shapes, *integration)
 

@@ -296,6 +296,8 @@ class SymbolicModel(SteppedModel):
                 why = "a point mass knows nothing of it"
             elif name == "target_result":
                 why = f"a {type(self.target).__name__} has none"
+            elif name == "tangential_velocity":
+                why = "no friction moves the target (`ContactFriction.moves_target`)"
             elif name == "step_error":
                 why = "implicit steps keep it below `tolerance`"
             elif name == "hand_wrench":

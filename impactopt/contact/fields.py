@@ -159,14 +159,19 @@ def numbers_of(instance: Any) -> dict[str, float]:
 
 
 def check_numbers(instance: Any) -> None:
-    """InputError unless all parameters of a law or a target are numbers in their ranges.
+    """InputError unless all parameters of a law or a target are numbers in their ranges, or True or False.
 
     They may not be too large, nor so small that quotients are.
     """
     for field, description in abouts(type(instance)):
         unit = f" [{description.unit}]" if description.unit else ""
         name = f"{type(instance).__name__}: {field.name}{unit}"
-        number = description.checked(name, getattr(instance, field.name))
+        value = getattr(instance, field.name)
+        if isinstance(field.default, bool):
+            if not isinstance(value, bool):
+                raise InputError(f"{name} is {value!r}; give True or False")
+            continue
+        number = description.checked(name, value)
         if 0 < number < 1 / MOST and not description.allows(-1.0):
             zero = "0, or " if description.allows(0.0) else ""
             raise InputError(f"{name}: {number:g}; give {zero}a number of at least {1 / MOST:g}")

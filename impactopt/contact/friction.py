@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.contact.fields import Described, about, check_numbers
+from impactopt.contact.fields import Described, Parameters, about, check_numbers
+from impactopt.contact.targets.base import Target
 from impactopt.errors import InputError
 
 Array = NDArray[np.float64]
@@ -18,7 +19,7 @@ TINY = 1e-9  # [m] added to a deflection, whose length has no slope at zero
 
 @dataclass(frozen=True, kw_only=True)
 class ContactFriction(Described):
-    """Coulomb friction between the striking point and the target's surface, which does not move sideways.
+    """Coulomb friction between the striking point and the target's surface.
 
     The tangential force is against the slide v_t, and mu f |v_t| / sqrt(|v_t|^2 + v_s^2): below the slip
     speed v_s it is less than Coulomb's, so that it has a slope at rest (Andersson, Soderberg, Bjorklund,
@@ -35,6 +36,10 @@ class ContactFriction(Described):
     Olsson, Astrom, Lischinsky, "A new model for control of systems with friction", IEEE TAC 40, 1995), within
     the cone also while the normal force falls, as the sliders of Cundall and Strack (Geotechnique 29, 1979).
     It never gives more energy than it took. The limit of a high stiffness is the friction without bristles.
+
+    The surface moves along the normal alone, as that of a target on a rail. With `moves_target` it moves
+    across it too, as a point mass m, without rotation: m dv_s/dt is the friction on it, and v_t is relative
+    to v_s.
     """
 
     coefficient: float = field(metadata=about("Coulomb friction of the striking point", above=0, most=10))
@@ -47,6 +52,9 @@ class ContactFriction(Described):
     stiffness: float = field(
         default=0.0,
         metadata=about("stiffness of the bristles across the normal; 0: none", unit="N/m", least=0),
+    )
+    moves_target: bool = field(
+        default=False, metadata=about("true: a free mass is also pushed across the normal, as a point mass")
     )
 
     def __post_init__(self) -> None:
@@ -85,10 +93,32 @@ class ContactFriction(Described):
         return np.asarray((deflection + step * slide) / (1 + step * speed_of_return))
 
 
-def check_friction(name: str, given: Any) -> None:
-    """InputError unless it is a ContactFriction or None."""
-    if given is not None and not isinstance(given, ContactFriction):
+def check_friction(name: str, given: Any, target: Target) -> None:
+    """InputError unless it is a ContactFriction that the target can have, or None."""
+    if given is None:
+        return
+    if not isinstance(given, ContactFriction):
         raise InputError(f"{name} must be a ContactFriction, not {given!r}")
+    if given.moves_target and target.tangential_mass() is None:
+        raise InputError(
+            f"{name}: moves_target is for a FreeMass; a {type(target).__name__} is held across the normal: "
+            "leave it out"
+        )
+
+
+def moves_target(friction: ContactFriction | None) -> bool:
+    """True if there is friction that moves the target across the normal."""
+    return friction is not None and friction.moves_target
+
+
+def tangential_mobility(friction: ContactFriction | None, target: Target, parameters: Parameters) -> Any:
+    """Inverse mass [1/kg] of the target across the normal; 0 if friction does not move it."""
+    return 1 / target.tangential_mass(parameters) if moves_target(friction) else 0.0
+
+
+def tangential_outcome(velocity: Array) -> dict[str, float]:
+    """Outcome of a target that friction moves, from its velocity (3,) [m/s] across the normal."""
+    return {"tangential_speed_m_s": float(np.linalg.norm(velocity))}
 
 
 def pushed_way(normal: Any, speed: Any, coefficient: Any, slip_speed: Any) -> Any:

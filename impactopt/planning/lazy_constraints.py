@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Generic
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
@@ -66,15 +67,25 @@ def gear_caution(problem: ImpactProblem, found: Sequence[DriveLoads | None]) -> 
 
 
 def slide(problem: ImpactProblem, plan: Plan) -> float:
-    """Largest distance [m] of the striking point, across the normal, from where contact begins."""
+    """Largest distance [m] of the striking point from where it meets the target, across the normal."""
     # An impact without duration: nothing slides.
     if len(plan.collision.time) < 2 or plan.collision.time[-1] <= 0:
         return 0.0
     postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, CONTACT_SAMPLES)))
     points = np.array([striking_point(problem.robot, problem.striker, q) for q in postures])
+    points -= _target_displacement(plan.collision)
     # From where contact begins, unlike `slides_beyond`, which is about the hit point.
     tangential = (points - points[0]) @ across(problem.normal).T
     return float(np.linalg.norm(tangential, axis=1).max())
+
+
+def _target_displacement(collision: PlannedCollision) -> NDArray[np.float64]:
+    """Displacement (`CONTACT_SAMPLES`, 3) [m] of the target across the normal during contact."""
+    v, time, at = collision.tangential_velocity, collision.time, np.linspace(0.0, 1.0, CONTACT_SAMPLES)
+    if v is None:
+        return np.zeros((CONTACT_SAMPLES, 3))
+    moved = np.vstack([np.zeros(3), np.cumsum(np.diff(time)[:, None] * (v[1:] + v[:-1]) / 2, axis=0)])
+    return np.column_stack([np.interp(at * time[-1], time, x) for x in moved.T])
 
 
 def slides_beyond(term: Slide, plan: Plan) -> str:

@@ -15,7 +15,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.world import Ground, Obstacle, TargetBody
-from impactopt.contact.friction import check_friction
+from impactopt.contact.friction import check_friction, moves_target
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN, is_order
@@ -35,7 +35,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.motion_style import STYLES
-from impactopt.problem.objectives import Penetration
+from impactopt.problem.objectives import Penetration, TargetEnergy
 from impactopt.problem.terms import Grip, Term
 from impactopt.robots.checks import LEG, check_arms
 from impactopt.robots.gains import GainFactor, scaled_gains
@@ -221,7 +221,12 @@ def check_collision(problem: Any) -> None:
             'collision="virtual-mass" has a closed form for the law SpringDamper only, not '
             f"{type(problem.law).__name__}"
         )
-    check_friction("friction", problem.friction)
+    check_friction("friction", problem.friction, problem.target)
+    if moves_target(problem.friction) and any(isinstance(o, TargetEnergy) for o in problem.objectives):
+        raise InputError(
+            "objectives: TargetEnergy is of motion along the normal, and friction's moves_target adds some "
+            "across it: leave one of them out"
+        )
     if problem.friction is not None and problem.collision != "full":
         raise InputError(
             f'friction: the model {problem.collision!r} of the collision has none: take collision="full", or '

@@ -34,6 +34,9 @@ def problem_hash(problem: Any) -> str:
     for name in ("stances", "friction"):
         if not data[name]:
             data.pop(name)
+    if (friction := data.get("friction")) is not None and not friction.moves_target:
+        rubs = vars(friction)
+        data["friction"] = type(friction).__name__, {key: rubs[key] for key in rubs if key != "moves_target"}
     data.pop("ground")
     if not problem.stands:
         data["ground"] = problem.ground_height

@@ -100,7 +100,7 @@ class ImpactProblem:
         fixed base; otherwise z = 0 is the ground on which the soles stand, and the origin is in the middle of
         the soles in the start posture.
     normal (3,) : unit vector in the world frame, along which the target is pushed.
-    friction : between the striking points and the target, which does not move sideways; None: no friction.
+    friction : between the striking points and the target; None: no friction.
     second : another striker that hits the same target at the same time, at its own point.
     law, target : contact law and target. In a plan a `Nail` moves once, and stops before the striker leaves
         it.

@@ -189,6 +189,8 @@ def worst_constraints(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str
 def target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     """Rows of the impact's effects on the target."""
     yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
+    across = [target.get("tangential_speed_m_s") for target in targets]
+    yield number_row("speed of the target across the normal [m/s]", across, 3)
     yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
     yield word_row("the board breaks", [target.get("broken") for target in targets])
 

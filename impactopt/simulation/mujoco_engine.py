@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.contact.friction import tangential_mobility, tangential_outcome
 from impactopt.errors import InputError, check_choice, check_positive
 from impactopt.robots.loads import MIN_LOAD_FRACTION, weight_of
 from impactopt.robots.robot import Robot
@@ -82,7 +83,9 @@ class _Replay(MujocoRobot):
         in_contact = [k for pairs in link_pairs for pair in pairs for k in pair]
         world = build_world(robot, self.scene, perturbation, solver, near, in_contact)
         sites = (site_name(k + 1) for k in range(len(scene.strikers)))
-        super().__init__(robot, world, *sites, friction=scene.friction)
+        target = self.scene.target
+        mobility = tangential_mobility(scene.friction, target, target.parameters)
+        super().__init__(robot, world, *sites, friction=scene.friction, mobility=mobility)
         self.links = LinkContact(self.mujoco, self.world, link_pairs) if link_pairs else None
         self.depths = np.full(len(scene.strikers), -np.inf)  # [m] of striking points in the target
         if self.links is not None:
@@ -157,7 +160,7 @@ class _Replay(MujocoRobot):
     # ---------------------------------------------------------------- parts of a step
     def hand_speeds(self) -> Array:
         """Speeds (h,) of the striking points along the normal [m/s]; updates their depths in the target."""
-        places = self.striking_points()
+        places = self.striking_points() - self.tangential[0]
         if self.last_depths is not None:
             # The contact's integration gives depths more exactly than MuJoCo's step gives the robot: take the
             # travel that makes them agree.
@@ -210,7 +213,9 @@ class _Replay(MujocoRobot):
             self.last_depths = push.depths
             if self.links is not None:  # to depths of the points in the target's plane, as in `hand_speeds`
                 self.last_depths = (
-                    self.last_depths + contact.depths(self.striking_points(), self.travel) - depths
+                    self.last_depths
+                    + contact.depths(self.striking_points() - self.tangential[0], self.travel)
+                    - depths
                 )
         else:
             state, travel = contact.untouched_step(self.target, self.travel, step)
@@ -236,7 +241,8 @@ class _Replay(MujocoRobot):
             broken = bool(self.scene.target.outcome(self.target).get("broken", False))
         elif travel == self.travel:
             return
-        self.unintended.place_target(self.data, self.travel * self.scene.normal + broken * AWAY)
+        displacement = self.travel * self.scene.normal + self.tangential[0] + broken * AWAY
+        self.unintended.place_target(self.data, displacement)
         self.placed = self.target, self.travel, broken
 
     # ---------------------------------------------------------------- recorded quantities
@@ -460,6 +466,9 @@ def simulate_mujoco(
                 if fall:
                     fall = f"{fall} at t = {t:.2f} s"
                     break
+    outcome = replay.scene.target.outcome(last_touched)
+    if replay.mobility:
+        outcome |= tangential_outcome(replay.tangential[1])
     simulation = simulation_of(
         robot,
         replay.scene,
@@ -468,7 +477,7 @@ def simulate_mujoco(
         engine="mujoco",
         impulse=float(impulses.sum()),
         impulses=impulses,
-        outcome=replay.scene.target.outcome(last_touched),
+        outcome=outcome,
         saturated=saturated,
         cuts=cuts.cuts() if motors.lines else None,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),

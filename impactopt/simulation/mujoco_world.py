@@ -341,10 +341,17 @@ class MujocoRobot:
     force_map (h, nv) : generalized forces of a unit of normal force at each, friction included;
         without friction the same array; that of bristles is set by `bend`
     deflections (h, 3), normal_forces (h,) : of the bristles [m], and the last forces [N] of `bend`
+    mobility : inverse mass [1/kg] of the target across the normal, see `tangential_mobility`
+    tangential (2, 3) : displacement [m] and velocity [m/s] of the target across the normal
     """
 
     def __init__(
-        self, robot: Robot, world: Any, *strikers: str, friction: ContactFriction | None = None
+        self,
+        robot: Robot,
+        world: Any,
+        *strikers: str,
+        friction: ContactFriction | None = None,
+        mobility: float = 0.0,
     ) -> None:
         self.mujoco, self.robot, self.world = mujoco_module(), robot, world
         self.data = self.mujoco.MjData(world)
@@ -357,6 +364,7 @@ class MujocoRobot:
         self._jacobian, self.normal_jacobian = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
         self.sliding = None if friction is None else SlidingPoints(friction)
         self.deflections, self.normal_forces = np.zeros((len(strikers), 3)), np.zeros(len(strikers))
+        self.mobility, self.tangential = mobility, np.zeros((2, 3))
         self.force_map = self.normal_jacobian if friction is None else np.zeros_like(self.normal_jacobian)
 
     def put(self, q: Array, v: Array | None = None) -> None:
@@ -405,16 +413,24 @@ class MujocoRobot:
             if self.sliding is not None:
                 jacobians.append(J.copy())
         if self.sliding is not None:
+            self.sliding.surface = self.tangential[1]
             self.sliding.update(normal, jacobians, self.data.qvel)
             self.force_map = self.sliding.force_map(self.deflections, self.normal_forces)
         return np.asarray(self.normal_jacobian @ self.data.qvel)
 
     def bend(self, forces: Array, step: float) -> None:
-        """Advances the bristles by a step [s] under normal forces (h,) [N], and sets `force_map`."""
+        """Advances the bristles by a step [s] under normal forces (h,) [N], and sets `force_map`.
+
+        Advances a target that friction moves across the normal, too.
+        """
         if self.sliding is not None and self.sliding.bristles:
             self.normal_forces = forces
             self.deflections = self.sliding.deflected(self.deflections, forces, step)
             self.force_map = self.sliding.force_map(self.deflections, forces)
+        if self.sliding is not None and self.mobility:
+            # semi-implicit Euler, as MuJoCo's: the displacement follows from the new velocity
+            velocity = self.tangential[1] + step * self.mobility * self.sliding.on_target(forces)
+            self.tangential = np.array([self.tangential[0] + step * velocity, velocity])
 
     def apply(self, torque: Array, forces: Array | float) -> None:
         """Applies torques (n,) [N m] at the joints, and contact forces (h,) [N] against the normal."""

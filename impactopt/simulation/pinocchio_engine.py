@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.contact.friction import tangential_mobility, tangential_outcome
 from impactopt.robots.robot import Robot
 from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors, Servo
 from impactopt.simulation.pinocchio_robot import Body, recursive_body
@@ -42,6 +43,7 @@ class _State:
     impulses: Array  # (h,) of each striker on the target [N s]
     drive: Array  # (n,) torque of the motors [N m]
     deflections: Array  # (h, 3) of the strikers' bristles [m]
+    tangential: Array  # (2, 3) displacement [m] and velocity [m/s] of the target across the normal
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,7 @@ class _World:
         self.fixed, self.body = self._body_of(self._stance)
         self.servo, self.contact = Servo(robot, reference), TargetContact(scene)
         self.motors, self.delay = Motors(robot), Delay(robot)
+        self.mobility = tangential_mobility(scene.friction, scene.target, scene.target.parameters)
 
     def follow(self, reference: Any) -> None:
         """Sets the reference that the servo follows from now on."""
@@ -125,13 +128,14 @@ class _World:
         commanded = np.array(self.servo.torque(t, self.robot.angles.of(q), v[self.base :]))
         drive = self.motors.cut(commanded[1], v[self.base :])
         h = len(self.scene.strikers)
-        return _State(q, v, travel, self.contact.untouched, np.zeros(h), drive, np.zeros((h, 3)))
+        straight = np.zeros((h, 3)), np.zeros((2, 3))
+        return _State(q, v, travel, self.contact.untouched, np.zeros(h), drive, *straight)
 
     def depths(self, s: _State) -> Array:
         """Depths (h,) [m] of the striking points in the target, in the current state; -inf without one."""
         if self.missing:
             return np.full(len(self.scene.strikers), -np.inf)
-        return self.contact.depths(self.body.striking_points(), s.travel)
+        return self.contact.depths(self.body.striking_points() - s.tangential[0], s.travel)
 
     def rates(self, t: float, s: _State, *, forces: Array | None = None, step: float = 0.0) -> _Rates:
         """Rates of a state.
@@ -149,7 +153,7 @@ class _World:
         torque = self.motors.now(s.drive, cut)
         push, contact, inside = None, self.contact, forces is None
         forces = contact.forces(depths, speeds, s.target) if forces is None else forces
-        body.bend(s.deflections, forces)
+        body.bend(s.deflections, forces, s.tangential[1])
         if inside and contact.near(depths, speeds, s.target, step):
             units = np.eye(len(speeds))
             a = body.accelerate(torque, 0.0 * speeds)
@@ -191,6 +195,21 @@ class _World:
         ]
         return np.concatenate([np.zeros((0, 3)), *places])
 
+    def outcome(self, last_touched: Array, s: _State) -> dict[str, float]:
+        """Outcome from the target's state at the last touch (n_states,), and a state after it."""
+        found = self.scene.target.outcome(last_touched)
+        return found | tangential_outcome(s.tangential[1]) if self.mobility else found
+
+    def _pushed_tangentially(self, before: Array, s: _State, forces: Array, h: float) -> Array:
+        """`_State.tangential` after a step [s] from `before`, by the rates in the state of the last `rates`.
+
+        forces : (h,) [N] normal ones.
+        """
+        if not self.mobility or self.body.sliding is None:
+            return before
+        friction = self.body.sliding.on_target(forces)
+        return before + h * np.array([s.tangential[1], self.mobility * friction])
+
     def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:
         """State after a step h [s] of the explicit midpoint rule, under the contact's mean forces in it.
 
@@ -202,6 +221,7 @@ class _World:
             a = self.body.accelerate(first.torque, push.first_half)
         bent = first.forces if push is None else push.first_half
         deflections = self.body.deflected(s.deflections, bent, h / 2)
+        tangential = self._pushed_tangentially(s.tangential, s, bent, h / 2)
         half = _State(
             # explicit midpoint rule: half a step by the rates at the start, then a whole one by the rates in
             # its middle
@@ -212,6 +232,7 @@ class _World:
             impulses=s.impulses,
             drive=self.motors.after(s.drive, first.cut, h / 2),
             deflections=deflections,
+            tangential=tangential,
         )
         # mean forces of the whole step, so that momentum is exchanged exactly as the target's integration has
         # it
@@ -228,6 +249,7 @@ class _World:
             impulses=s.impulses + h * middle.forces,
             drive=self.motors.after(s.drive, middle.cut, h),
             deflections=self.body.deflected(s.deflections, middle.forces, h),
+            tangential=self._pushed_tangentially(s.tangential, half, middle.forces, h),
         )
         if push is None:
             return after
@@ -296,7 +318,7 @@ def follow_contact(
     return Followed(
         impulse=float(state.impulses.sum()),
         peak=float(touches.curve()[1].max(initial=0.0)),
-        outcome=scene.target.outcome(last_touched),
+        outcome=world.outcome(last_touched, state),
         touches=tuple((start, end) for start, end, _ in touches.intervals),
         events=tuple(events),
     )
@@ -383,7 +405,7 @@ def simulate_pinocchio(
         engine="pinocchio",
         impulse=float(state.impulses.sum()),
         impulses=state.impulses,
-        outcome=scene.target.outcome(last_touched),
+        outcome=world.outcome(last_touched, state),
         saturated=saturated,
         cuts=cuts.cuts() if world.motors.lines else None,
         posture_error=posture_error(robot.model, state.q, np.asarray(world.followed.q[-1])),

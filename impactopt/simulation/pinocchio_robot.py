@@ -38,7 +38,7 @@ class Body(ABC):
 
     `normal_jacobian` (h, nv) gives the speeds of the h striking points along the normal. `force_map` (h, nv)
     maps a unit of normal force at each, friction included, to generalized forces; without friction both are
-    the same. That of bristles is set by `bend`.
+    the same. That of bristles, and of a target that friction moves, is set by `bend`.
     """
 
     def __init__(
@@ -114,9 +114,13 @@ class Body(ABC):
             self.sliding.update(self.normal, jacobians, v)
             self.force_map = self.sliding.force_map(*self._unbent)
 
-    def bend(self, deflections: Array, forces: Array) -> None:
-        """Sets `force_map` for bristles with deflections (h, 3) [m] under normal forces (h,) [N]."""
-        if self.sliding is not None and self.sliding.bristles:
+    def bend(self, deflections: Array, forces: Array, surface: Array) -> None:
+        """Sets `force_map` for bristles with deflections (h, 3) [m] under normal forces (h,) [N].
+
+        surface (3,) : velocity [m/s] of the target across the normal, if friction moves it.
+        """
+        if self.sliding is not None and (self.sliding.bristles or self.sliding.friction.moves_target):
+            self.sliding.surface = surface
             self.force_map = self.sliding.force_map(deflections, forces)
 
     def deflected(self, deflections: Array, forces: Array, step: float) -> Array:

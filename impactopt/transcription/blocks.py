@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 
 from impactopt.collision.settings import Effects
+from impactopt.contact.friction import moves_target
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
@@ -63,14 +64,17 @@ def sizes(
     frozen: bool = False,
     second: bool = False,
     bristles: bool = False,
+    moves_target: bool = False,
 ) -> dict[str, int]:
     """Lengths of the named slices of a block's output, in order.
 
     frozen : of a model with frozen dynamics.  second : with a second striker.  bristles : of friction.
+    moves_target : friction moves the target across the normal.
     """
     n, base, soles = c.robot.n, c.base, len(c.legs)
     legs = {"legs": c.nl, "lag": c.nl, "hand": 1} if frozen else {}
     bent = {"bristles": 3 + 3 * second} if bristles else {}
+    bent |= {"tangential": 3} if moves_target else {}
     coasting = {"rate": c.nl, "acceleration": c.nl} if frozen else {"twist": 6 * soles}
     return {
         "node": {"closure": 6 * soles, "base": base, "torque": n, "leg_rate": c.nl, "extension": soles},
@@ -272,6 +276,7 @@ def builders(
     second: str = "",
     gain_groups: JointGroups = (),
     friction: int = 0,
+    moves_target: bool = False,
 ) -> dict[str, Callable[[], BlockExpression]]:
     """Functions that build the expressions of the blocks, by name.
 
@@ -281,10 +286,10 @@ def builders(
     frozen, freezes : terms of a model with frozen dynamics, and its number of freezes during contact.
     first : with the first instant of contact.  second : another striker.
     gain_groups : joints that share a gain factor.  friction : number of parameters of the
-        striking points' friction.
+        striking points' friction.  moves_target : it moves the target across the normal.
     """
     lasting: dict[str, Callable[[], BlockExpression]] = {
-        "collision": lambda: collision(c, striker, frozen, second, gain_groups, friction),
+        "collision": lambda: collision(c, striker, frozen, second, gain_groups, friction, moves_target),
         "force": lambda: force(c, striker, law, target, frozen, second),
     }
     if c.legs:
@@ -361,6 +366,7 @@ def own_blocks(
         second="" if problem.second is None else problem.second.striker,
         gain_groups=problem.gain_joints,
         friction=0 if problem.friction is None else len(problem.friction.parameters),
+        moves_target=moves_target(problem.friction),
     )
 
 

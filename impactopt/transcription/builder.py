@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impactopt.contact.friction import moves_target
 from impactopt.errors import InputError, did_you_mean
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
@@ -165,6 +166,7 @@ class Builder:
             frozen=frozen,
             second=second,
             bristles=friction is not None and friction.bristles,
+            moves_target=moves_target(friction),
         )
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from impactopt.contact.friction import moves_target, tangential_mobility, tangential_outcome
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN
 from impactopt.kinematics.coordinates import StanceCoordinates
@@ -258,6 +259,7 @@ class Collision(ContactParameters):
         self.xt = add("target travel", 1, labels=["target"])
         bent = 3 * len(p.strikers) if len(friction_parameters(p)) > 2 else 0
         self.bristles = add("bristle deflection", bent, scale=DEPTH_SCALE)
+        self.tangential = add("target tangential velocity", 3 * moves_target(p.friction))
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
         # from the third phase on: before the second one the mean rate is the d of the first
@@ -299,7 +301,7 @@ class Collision(ContactParameters):
 
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of each block's instances, one a stage."""
-        b, p = self._b, self._b.problem
+        p = self._b.problem
         zero, at_rest = Affine.zeros(1), Affine.zeros(p.target.n_states)
         collision, force = [], []
         for i, s in enumerate(self.stages):
@@ -309,12 +311,8 @@ class Collision(ContactParameters):
             impulse_slope, x1 = self._slots(self.p, i, zero)[1], self._before(s.phase)[2]
             collision.append(self._dynamics(i))
             force.append([*self._hand_slots(i), self.f[i], *state, *travel, x1, impulse_slope])
-        common = np.concatenate(
-            [*self._gains(), b.robot.torque_limit, b.limits.units, friction_parameters(p)]
-        )
-        collision_p = [np.concatenate([p.normal, [s.place], common]) for s in self.stages]
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
-            "collision": (collision, collision_p),
+            "collision": (collision, self.dynamics_parameters()),
             "force": (force, self.force_parameters()),
             **self._reference(),
         }
@@ -323,13 +321,22 @@ class Collision(ContactParameters):
             out["join"] = join, [np.zeros(0)] * len(join)
         return out
 
+    def dynamics_parameters(self) -> list[Array]:
+        """Parameters of the block ``collision`` at each stage."""
+        b, p = self._b, self._b.problem
+        mobility = [tangential_mobility(p.friction, p.target, self.target)] if self.tangential.size else []
+        common = [*self._gains(), b.robot.torque_limit, b.limits.units, friction_parameters(p), mobility]
+        return [np.concatenate([p.normal, [s.place], *common]) for s in self.stages]
+
     def _dynamics(self, i: int) -> list[Affine]:
         """Slots of the block ``collision``."""
         y, u0, ff = self.contact.state.y, self.contact.u0[0], self._feedforward()
         reference = [self.coast_legs[i], self.coast_rates[i]]
         motion = [*self._travel(i), *self._slots(self.u, i, u0), self.legs[i]]
         bent = self._slots(self.bristles, i, Affine.zeros(self.bristles.size))
-        return [y, u0, *reference, ff, *motion, self.f[i], self.w[i], *bent, self.contact.gains[0]]
+        moved = self._slots(self.tangential, i, Affine.zeros(self.tangential.size))
+        forces = [self.f[i], self.w[i]]
+        return [y, u0, *reference, ff, *motion, *forces, *bent, *moved, self.contact.gains[0]]
 
     def _hand_slots(self, i: int) -> list[Affine]:
         """Slots of the block ``force`` that determine the hand's position and speed."""
@@ -345,7 +352,7 @@ class Collision(ContactParameters):
 
     def states(self) -> tuple[Group, ...]:
         """Collocated variables whose value at contact is known, beside those of `integrated`."""
-        return self.state, self.xt, self.p, self.bristles
+        return self.state, self.xt, self.p, self.bristles, self.tangential
 
     def kept_groups(self) -> list[Group]:
         """Variables that are not at stages: a mesh of finer elements keeps their values."""
@@ -601,6 +608,9 @@ class Collision(ContactParameters):
             bristles = [f"bristle {k}" for k in range(self.bristles.size)]
             outputs = first["collision"] + part["bristles"]
             b.equal("bristles", place, bristles, outputs, Measure("mm", 1e3 * DEPTH_SCALE, "off"))
+        if self.tangential.size:
+            outputs, off = first["collision"] + part["tangential"], Measure("m/s", 1.0, "off")
+            b.equal("target's motion", place, [f"tangential {x}" for x in "xyz"], outputs, off)
         self._bound_torques(place, first["collision"] + part["torque"], self.torque_fraction)
         if self.cone_margin is not None:
             minimum = b.limits.cone.minimum_force if self.scenario is None else 0.0
@@ -752,6 +762,10 @@ class Collision(ContactParameters):
         own = slice(start, start + len(self.stages))
         torque = outputs["collision"][own, b.parts("collision")["torque"]]
         speed = outputs["force"][own, b.parts("force")["speed"][0]]
+        outcome, tangential = target.outcome(self.state.read(x)[-1], self.target), None
+        if self.tangential.size:
+            tangential = np.vstack([np.zeros(3), self.tangential.read(x)])
+            outcome |= tangential_outcome(tangential[-1])
         return PlannedCollision(
             time=np.array([0.0, *time]),
             force=forces.sum(axis=1),
@@ -760,6 +774,7 @@ class Collision(ContactParameters):
             torque=np.vstack([self._feedforward().evaluate(x), torque]) * b.robot.torque_limit,
             sole_wrench=wrench,
             ground=total_ground_wrench(b.coordinates, wrench),
-            outcome=target.outcome(self.state.read(x)[-1], self.target),
+            outcome=outcome,
+            tangential_velocity=tangential,
             **self._joints(x, type(b.problem.law)(**self.law)),
         )

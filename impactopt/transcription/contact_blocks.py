@@ -70,6 +70,7 @@ def collision(
     second: str = "",
     gain_groups: JointGroups = (),
     friction: int = 0,
+    moves_target: bool = False,
 ) -> BlockExpression:
     """Equation of motion (6) at one collocation point of the collision.
 
@@ -81,22 +82,23 @@ def collision(
 
     frozen : terms of the frozen model; None: full dynamics.  second : another striker.
     gain_groups : joints whose gains have a factor each.  friction : number of its parameters; 3 with
-        bristles.
+        bristles.  moves_target : it moves the target across the normal.
 
     z = y0; u0 (ydot at contact);
         not frozen: legs and leg rates of the coasting reference;
         feed-forward over torque limit (n,); d1; T1; d; T; u (ydot); u'; legs; f [N], one a striker; w (6 a
         sole);
         bristles: deflections z [m], z', three a striker;
+        moves_target: velocity of the target across the normal (3,) [m/s], and its slope;
         frozen: y, ydot and legs of the freeze; rates of the reference's legs at the beginning of the segment,
         their accelerations at the freeze; rates r of the legs, r'; lag of the legs behind the reference,
         lag'; time [s] since the beginning of the segment; slope of the hand's speed; without bias, wrenches
         that carry the weight (nw,); logarithms of the gain factors.
     p = normal (3,); s (place in the phase); Kp, Kd, torque limits (n, each); weight [N]; lever [m]; with
-        friction the parameters of `ContactFriction`.
+        friction the parameters of `ContactFriction`; with moves_target the target's mobility [1/kg].
     out = closure [m, rad]; base equations over weight and weight x lever; joint equations over torque limit;
-        servo torque over limit; residuals of z' over 1 cm; frozen: residuals of r', of lag' and of the slope
-        of the hand's speed.
+        servo torque over limit; residuals of z' over 1 cm; of the target's tangential velocity;
+        frozen: residuals of r', of lag' and of the slope of the hand's speed.
     """
     ny, n, nl, nw = c.ny, c.robot.n, c.nl, 6 * len(c.legs)
     y0, u0, d1, d, u, u1 = (ca.SX.sym(s, ny) for s in ("y0", "u0", "d1", "d", "u", "u1"))
@@ -108,6 +110,8 @@ def collision(
     weight, lever, logs = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("logs", len(gain_groups))
     of_friction = ca.SX.sym("friction", friction)
     bent, bent1 = (ca.SX.sym(s, 3 * len(strikers) * (friction > 2)) for s in ("bent", "bent1"))
+    side, side1 = (ca.SX.sym(s, 3 * moves_target) for s in ("tangential", "tangential1"))
+    mobility = ca.SX.sym("mobility", int(moves_target))
     t = T1 + T * s  # since contact
     y, ydd = ca.SX.sym("y", ny), ca.SX.sym("ydd", ny)
     through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
@@ -129,19 +133,21 @@ def collision(
     q = c.configuration(at[0], at[2])
     # equation (6): H a + bias + j' f - J_c' w = S' tau
     tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
-    bristles = ca.SX(0, 1)  # residuals of z'
+    bristles, push = ca.SX(0, 1), ca.SX.zeros(3)  # residuals of z'; friction on the target
     for k, name in enumerate(strikers):
         J, way = _striker_jacobian(c, name, q), normal
+        slide = ca.mtimes(J, v) - side if moves_target else ca.mtimes(J, v)
         if friction > 2:
             mu, slip_speed, bristle_stiffness = ca.vertsplit(of_friction)
             z, z1 = bent[3 * k : 3 * k + 3], bent1[3 * k : 3 * k + 3]
             leaning = lean(z, f[k], mu, bristle_stiffness)
             way = normal + mu * leaning
-            slope = T * deflection_rate(normal, ca.mtimes(J, v), leaning, slip_speed)
+            slope = T * deflection_rate(normal, slide, leaning, slip_speed)
             bristles = ca.vertcat(bristles, (z1 - slope) / DEPTH_SCALE)
         elif friction:
-            way = pushed_way(normal, ca.mtimes(J, v), *ca.vertsplit(of_friction))
+            way = pushed_way(normal, slide, *ca.vertsplit(of_friction))
         tau += ca.mtimes(J.T, way) * f[k]
+        push += (way - normal) * f[k]
     # Without bias H a has no weight, so the part of w that carries it must not stand in the balance either.
     tau -= c.sole_wrench_map(at[0], at[2], w - carried)
     # Reference minus robot: angles and rates of the constrained legs' joints, ...
@@ -171,11 +177,13 @@ def collision(
         "joints": tau[c.base :] / limit - servo,
         "torque": servo,
         "bristles": bristles,
+        "tangential": side1 - T * mobility * push if moves_target else ca.SX(0, 1),
         **slopes,
     }
-    z = [y0, u0, *(own if frozen is None else []), ff, d1, T1, d, T, u, u1, legs, f, w, bent, bent1]
+    z = [y0, u0, *(own if frozen is None else []), ff, d1, T1, d, T, u, u1, legs, f, w]
+    z += [bent, bent1, side, side1]
     z += [*(own if frozen is not None else []), logs]
-    p = [normal, s, kp, kd, limit, weight, lever, of_friction]
+    p = [normal, s, kp, kd, limit, weight, lever, of_friction, mobility]
     return make_block(z, p, out, through, lanes=4, stages=stages)
 
 

@@ -308,7 +308,7 @@ def map_contact(new: Collision, old: Collision, into: Array, x: Array) -> None:
     into : solver variables of the new collision's program, which are written.  x : of the old one's.
     """
     start = {"u": old.contact.u0.read(x), "state": np.zeros((1, old.state.size))}
-    start["bristles"] = np.zeros((1, old.bristles.size))
+    start |= {name: np.zeros((1, getattr(old, name).size)) for name in ("bristles", "tangential")}
     start |= {name: np.zeros((1, 1)) for name in ("xt", "p")}
     for name, at_contact in start.items():
         weights = _weights(new.stages, old.stages, each_phase=name == "xt")

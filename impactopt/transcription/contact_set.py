@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.contact.friction import moves_target
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision, FirstInstant
@@ -138,6 +139,9 @@ class ContactSet:
     def _update_force(self, b: Builder) -> None:
         parameters = [each for c in self.collisions for each in c.force_parameters()]
         b.block("force").take_parameters(np.array(parameters))
+        if moves_target(b.problem.friction):  # the target's mass is in the equations of motion, too
+            parameters = [each for c in self.lasting for each in c.dynamics_parameters()]
+            b.block("collision").take_parameters(np.array(parameters))
         for collision in self.collisions:
             collision.update_bounds()
 

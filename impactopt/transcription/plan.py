@@ -283,8 +283,9 @@ class PlannedCollision:
         collocation point.
     force (m + 1,), forces (m + 1, strikers) : [N] total contact force, and that on each striker.
     target_speed (m + 1,) : of the target's surface [m/s].
+    tangential_velocity (m + 1, 3) : [m/s] across the normal, of a target that friction moves; else None.
     outcome : effect on the target, by name and unit (``speed_m_s`` of a free mass, ``depth_m`` of a nail,
-        ``broken`` of a board).
+        ``broken`` of a board, ``tangential_speed_m_s`` if friction moves it across the normal).
     torque (m + 1, n) : servo and feed-forward [N m].
     ground (m, 6) : ground wrench about the world's origin [N, N m].
     sole_wrench (m, 6 a sole, 6 a supporting hand) : in their own frames [N, N m].
@@ -302,6 +303,7 @@ class PlannedCollision:
     velocity: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     acceleration: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     forces: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    tangential_velocity: Array | None = field(default=None, repr=False)
 
     @property
     def peak_force(self) -> float:

@@ -19,6 +19,7 @@ from typing import Any, cast
 import numpy as np
 
 from impactopt.codegen.cache import FunctionGroup, cached_groups, model_hash
+from impactopt.contact.friction import moves_target
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.block import BlockExpression
@@ -85,8 +86,9 @@ def block_functions(
     springs = tuple(np.flatnonzero(robot.sprung).tolist())
     second = () if problem.second is None else (problem.second.striker,)
     rubs = () if problem.friction is None else ("rubs", len(problem.friction.parameters))
+    moves = ("moves",) if moves_target(problem.friction) else ()
     keys = {"force": (*contact, *second), "first": (*contact[:1], *rubs), "coasting": frozen}
-    keys |= {"collision": (*frozen, *springs, *second, *rubs), **dict.fromkeys(SECOND_BLOCKS, second)}
+    keys |= {"collision": (*frozen, *springs, *second, *rubs, *moves), **dict.fromkeys(SECOND_BLOCKS, second)}
     if chosen := problem.gain_joints:
         keys |= {name: (*keys.get(name, ()), chosen) for name in ("collision", "spring")}
     found = {

@@ -155,6 +155,16 @@ def test_models_agree_on_a_short_blow(file: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("model", ["sdc", "virtual-mass", "full"])
+def test_collide_has_the_motion_of_a_target_across_the_normal(file: Path, model: str) -> None:
+    rough = ("--set", "friction.coefficient=0.6", "--set", "friction.moves_target=true", "--model", model)
+    found = json.loads(run("collide", file, "--speed", 0.5, *rough, "--json", "-q")[0])
+    speeds = found["target"]["speed_m_s"], found["target"]["tangential_speed_m_s"]
+    assert speeds[1] > 1e-3
+    assert found["energy_J"] == pytest.approx(0.5 * 0.5 * np.square(speeds).sum(), rel=1e-6)
+    assert "speed of the target across the normal" in run("collide", file, "--speed", 0.5, *rough)[0]
+
+
 def test_collide_shows_a_table_and_takes_settings(file: Path) -> None:
     out, err = run("collide", file, "--speed", 0.5, "--set", "target.mass=2", "--posture", "ready")
     assert "impulse [N s]" in out and "shoulder" in out and "s  " in err

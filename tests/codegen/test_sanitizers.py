@@ -91,6 +91,10 @@ PROGRAMS: dict[str, tuple[dict[str, Any], Callable[[SDC], Any]]] = {
         {"contact_friction": ContactFriction(coefficient=0.6), "freezes": 2},
         lambda one: native_collision(one, ("impulse", "force", "velocity")),
     ),
+    "friction that moves the target, freezes": (
+        {"contact_friction": ContactFriction(coefficient=0.6, moves_target=True), "freezes": 2},
+        lambda one: native_collision(one, ("impulse", "energy", "tangential_velocity")),
+    ),
     "friction at the hit, no drifts": (
         {"contact_friction": ContactFriction(coefficient=0.6), "effects": Effects.none()},
         lambda one: native_collision(one, ("impulse", "force", "velocity")),

@@ -256,6 +256,7 @@ class Blow:
         driven = np.concatenate([np.ones(robot.base), np.where(r.sprung, 0.0, 1.0)[robot.independent]])
         lifted = self.torque(i) if self.torque(i) in self.lifted else None
         bristles = robot.friction is not None and robot.friction.stiffness > 0
+        carried = robot.friction is not None and robot.friction.moves_target
 
         def value(v: Variables) -> Array:
             y0, u0, ff = self._start(v), v.get("rate at contact"), v.get("feed-forward at contact")
@@ -264,7 +265,8 @@ class Blow:
             w, f = self.get(v, "collision sole wrench", i), self.get(v, "contact force", i)
             q, qd, qdd = self.motion(v, i)
             bent = self.get(v, "bristle deflection", i).reshape(-1, 3) if bristles else np.zeros((0, 3))
-            tau = robot.torque(q, qd, qdd, w, f, bent)
+            side = self.get(v, "target tangential velocity", i) if carried else np.zeros(3)
+            tau = robot.torque(q, qd, qdd, w, f, bent, side)
             lag = self.get(v, "coasting legs", i) - legs
             slower = self.get(v, "coasting leg rates", i) - qd[robot.base + dependent]
             ahead, faster = joints(y0 + driven * u0 * time - y, lag), joints(u0 - u, slower)
@@ -272,11 +274,16 @@ class Blow:
             found = [robot.closure(q), tau[: robot.base] / robot.base_scale]
             bounded = servo if lifted is None else servo - v.get(lifted)
             out = np.concatenate([*found, tau[robot.base :] / r.torque_limit - servo, bounded, inside(w)])
-            if not bristles:
-                return out
-            slope = self.slope(v, "bristle deflection", i, np.zeros(bent.size))
             T = v.one(self.durations[self.stages[i].phase])
-            return np.concatenate([out, (slope - T * robot.bending(q, qd, f, bent)) / DEPTH])
+            if bristles:
+                slope = self.slope(v, "bristle deflection", i, np.zeros(bent.size))
+                out = np.concatenate([out, (slope - T * robot.bending(q, qd, f, bent, side)) / DEPTH])
+            if carried:
+                given = np.sum([push for _, push in robot.pushes(q, qd, f, bent, side)], axis=0)
+                given -= robot.normal * f.sum()
+                slope = self.slope(v, "target tangential velocity", i, np.zeros(3))
+                out = np.concatenate([out, slope - T * given / self.target["mass"]])
+            return out
 
         closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
         inside, cone = limits.cone_rows(robot, place, self.margin or 0.0, self.least)
@@ -291,6 +298,8 @@ class Blow:
         if bristles:
             each = [f"bristle {k}" for k in range(3 * len(robot.hands))]
             cone = [*cone, ("bristles", place, each, 0.0, 0.0)]
+        if carried:
+            cone = [*cone, ("target's motion", place, [f"tangential {x}" for x in "xyz"], 0.0, 0.0)]
         return Piece.of(value, [*rows, *cone])
 
     def torque(self, i: int) -> str:

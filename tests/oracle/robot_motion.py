@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 GRAVITY = 9.81  # [m/s2] of the scale of forces, whatever the robot's is
 LEVER = 0.1  # [m] by which rows weigh moments against forces
 _AXES = pin.LOCAL_WORLD_ALIGNED
+STILL = np.zeros(3)
 
 
 class RobotMotion:
@@ -191,9 +192,12 @@ class RobotMotion:
         wrenches: Array,
         forces: Iterable[float] = (),
         bent: Sequence[Array] = (),
+        side: Array = STILL,
     ) -> Array:
         """Generalized force (nv,) that this motion needs, under wrenches (6 a sole) in the soles' frames and
         the contact's normal forces [N] at the hands.
+
+        side : (3,) [m/s] velocity of the target across the normal.
         """
         model, data = self.model, self.data
         tau: Array = np.array(pin.rnea(model, data, q, v, a))
@@ -204,30 +208,39 @@ class RobotMotion:
                 tau[joint.idx_v] += drive.spring_stiffness * (q[joint.idx_q] - drive.spring_rest)
         if self.soles:
             self.relieve(tau, q, wrenches)
-        return tau + self.pushed(q, v, forces, bent)
+        return tau + self.pushed(q, v, forces, bent, side)
 
-    def pushed(self, q: Array, v: Array, forces: Iterable[float], bent: Sequence[Array] = ()) -> Array:
-        """Generalized force (nv,) against normal forces [N] on the hands, and against their friction.
+    def pushed(
+        self, q: Array, v: Array, forces: Iterable[float], bent: Sequence[Array] = (), side: Array = STILL
+    ) -> Array:
+        """Generalized force (nv,) against normal forces [N] on the hands, and against their friction."""
+        pushes = self.pushes(q, v, forces, bent, side)
+        return np.asarray(sum((jac.T @ push for jac, push in pushes), np.zeros(self.model.nv)))
+
+    def pushes(
+        self, q: Array, v: Array, forces: Iterable[float], bent: Sequence[Array] = (), side: Array = STILL
+    ) -> list[tuple[Array, Array]]:
+        """Jacobian (3, nv) of each hand, and its force (3,) on the target, by normal forces [N].
 
         bent : deflections (3,) [m] of each hand's bristles; (): not bent.
         """
-        out = np.zeros(self.model.nv)
+        out = []
         for k, (hand, force) in enumerate(zip(self.hands, forces, strict=False)):
-            jac, slide, full = self._slide(q, v, hand)
+            jac, slide, full = self._slide(q, v, hand, side)
             push = self.normal * force
             if self.friction is not None and self.friction.stiffness:
                 push = push + (self.leaning(force, bent[k])[0] if len(bent) else 0.0)
             elif self.friction is not None:
                 push = push + self.friction.coefficient * force * slide / full
-            out += jac.T @ push
+            out.append((jac, push))
         return out
 
-    def _slide(self, q: Array, v: Array, hand: int) -> tuple[Array, Array, float]:
-        """Jacobian (3, nv) of a hand, its velocity (3,) across the normal, and that speed with the slip's."""
+    def _slide(self, q: Array, v: Array, hand: int, side: Array) -> tuple[Array, Array, float]:
+        """Jacobian (3, nv) of a hand, its velocity (3,) across the target, and that speed with the slip's."""
         self._seen = None
         frame = pin.computeFrameJacobian(self.model, self.data, q, hand, _AXES)
         jac = np.reshape(frame, (6, self.model.nv))[:3]
-        fast = jac @ v
+        fast = jac @ v - side
         slide = fast - (fast @ self.normal) * self.normal
         slip = 0.0 if self.friction is None else self.friction.slip_speed
         return jac, slide, float(np.hypot(np.linalg.norm(slide), slip))
@@ -238,11 +251,13 @@ class RobotMotion:
         elastic = stiffness * float(np.hypot(np.linalg.norm(bent), 1e-9))  # bent by a nanometre at least
         return limit * stiffness * bent / max(limit, elastic), limit
 
-    def bending(self, q: Array, v: Array, forces: Iterable[float], bent: Sequence[Array]) -> Array:
+    def bending(
+        self, q: Array, v: Array, forces: Iterable[float], bent: Sequence[Array], side: Array
+    ) -> Array:
         """Rates (3 hands,) [m/s] of the deflections of the hands' bristles."""
         rates = []
         for hand, force, each in zip(self.hands, forces, bent, strict=False):
-            (pull, limit), (_, slide, full) = self.leaning(force, each), self._slide(q, v, hand)
+            (pull, limit), (_, slide, full) = self.leaning(force, each), self._slide(q, v, hand, side)
             rates.append(slide - full * pull / limit)
         return np.concatenate(rates)
 

@@ -299,11 +299,12 @@ def test_of_soles_that_change(blow: int) -> None:
     check_rows(t.with_clearance(rows))
 
 
+@pytest.mark.parametrize("moves", [False, True])
 @pytest.mark.parametrize("stiffness", [0.0, 8e3])
 @pytest.mark.parametrize("robot", ["arm", "biped"])
-def test_of_friction_at_the_hit(robot: str, stiffness: float) -> None:
+def test_of_friction_at_the_hit(robot: str, stiffness: float, moves: bool) -> None:
     """In the contact and at its first instant, where the servo's torques are variables."""
-    rough = ContactFriction(coefficient=0.6, stiffness=stiffness)
+    rough = ContactFriction(coefficient=0.6, stiffness=stiffness, moves_target=moves)
     p = {"arm": arm_problem, "biped": biped_problem}[robot]()
     t = transcribed(dataclasses.replace(p, friction=rough, terms=(*p.terms, GearLoad())))
     check_rows(t)

@@ -23,6 +23,12 @@ static void outputs_of(const Outcome *c, Work *w, double **res) {
   if (res[OUT_energy])
     *res[OUT_energy] =
         call(target_energy, y->target, w->data.target, 0) - call(target_energy, rest, w->data.target, 0);
+#if MOVES_TARGET
+  if (res[OUT_energy]) FOR(k, 3) *res[OUT_energy] += c->tangential[k] * c->tangential[k] / (2 * w->data.mobility);
+#endif
+#endif
+#ifdef OUT_tangential_velocity
+  if (res[OUT_tangential_velocity]) FOR(k, 3) res[OUT_tangential_velocity][k] = c->tangential[k];
 #endif
 #ifdef OUT_target_result
   if (res[OUT_target_result]) {

@@ -38,6 +38,9 @@ typedef struct {
 #if SLIDES
   double coefficient, slip_speed, stiffness, normal[3], point_velocity[3];
 #endif
+#if MOVES_TARGET
+  double mobility; /* inverse mass of the target across the normal; point_velocity is against its velocity there */
+#endif
 } Data;
 
 typedef struct {
@@ -144,6 +147,9 @@ INLINE void friction_at(const Data *d, const State *y, double force, double *out
   FOR(k, 3) {
     velocity[k] = d->point_velocity[k] + F->e_point[k] * y->time + dot(F->Q_point[k], y->torque, V);
     FOR(l, 3) velocity[k] -= F->m_point[k][l] * (d->normal[l] * y->impulse + y->sliding[l]);
+#if MOVES_TARGET
+    velocity[k] -= d->mobility * y->sliding[k];
+#endif
   }
   FOR(k, 3) along += d->normal[k] * velocity[k];
   FOR(k, 3) slide[k] = velocity[k] - d->normal[k] * along, square += slide[k] * slide[k];

@@ -54,6 +54,9 @@ static void load_data(const double **arg, Data *d) {
 #endif
   FOR(i, N_LAW) copy_or_zero(arg[ARG_law + i], d->law + i, 1);
   FOR(i, N_TARGET) copy_or_zero(arg[ARG_target + i], d->target + i, 1);
+#if MOVES_TARGET
+  d->mobility = call(tangential_mobility, d->target, 0, 0);
+#endif
 }
 
 /* Freezes the servo's reference, a polynomial in time: its acceleration at `time` since contact, and the change of its
@@ -105,6 +108,9 @@ typedef struct {
   State final;
   double impulse, duration, in_contact;
   double q[NQ], v[NV]; /* at the begin of the last segment */
+#if MOVES_TARGET
+  double tangential[3]; /* velocity of the target across the normal */
+#endif
 } Outcome;
 
 #if FREEZES
@@ -124,6 +130,9 @@ static void run_segments(const double **arg, Work *w, Outcome *c, double duratio
   FOR(i, V) d->velocity_before[i] = (vec){0};
   c->impulse = c->duration = 0.0;
   c->in_contact = 1.0;
+#if MOVES_TARGET
+  memset(c->tangential, 0, sizeof c->tangential);
+#endif
   FOR(i, n) {
     const double begin = whole ? ENDS[i] : 0.0, end = whole ? ENDS[i + 1] : 1.0, share = end - begin;
     const int last = i == n - 1;
@@ -146,6 +155,9 @@ static void run_segments(const double **arg, Work *w, Outcome *c, double duratio
 #endif
     };
     hand_speed_at(in, out, 0, 0, 0);
+#if MOVES_TARGET
+    FOR(k, 3) d->point_velocity[k] -= c->tangential[k];
+#endif
     double before[NV];
     FOR(k, NV) before[k] = c->v[k] - v[k];
     pad(d->velocity_before, V, before + NV - N, N, 0.0);
@@ -163,6 +175,9 @@ static void run_segments(const double **arg, Work *w, Outcome *c, double duratio
     c->impulse += reached.impulse;
     c->duration += reached.time;
     c->final = reached;
+#if MOVES_TARGET
+    FOR(k, 3) c->tangential[k] += d->mobility * reached.sliding[k];
+#endif
     start = reached;
     start.time = start.impulse = start.impulse2 = 0.0;
     memset(start.torque, 0, sizeof start.torque);
@@ -198,6 +213,9 @@ static void collide(const double **arg, double **res, Work *w, Outcome *c) {
   c->in_contact = run(d, &c->final, STEPS[0], record, &w->tape).contact;
   c->impulse = c->final.impulse;
   c->duration = c->final.time;
+#if MOVES_TARGET
+  FOR(k, 3) c->tangential[k] = d->mobility * c->final.sliding[k];
+#endif
 #else
   State reached = {0};
   FOR(i, V) d->velocity_before[i] = (vec){0};

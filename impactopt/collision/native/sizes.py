@@ -112,6 +112,7 @@ def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
         contact_force (x, rate, law) -> force
         target_velocity (z, target), target_rates (z, force, target), target_energy, target_result (z, target)
         target_inverse_mass, target_speed_before (target) : the results of `target_start`
+        tangential_mobility (target) : inverse mass of a target that friction moves across the normal
     """
     law_numbers, target_numbers = list(model.law.parameters), list(model.target.parameters)
     law, target = ca.SX.sym("law", len(law_numbers)), ca.SX.sym("target", len(target_numbers))
@@ -137,6 +138,9 @@ def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
         ca.Function("target_inverse_mass", [target], [_number(start[0])]),
         ca.Function("target_speed_before", [target], [_number(start[1])]),
     ]
+    if model.moves_target:
+        mobility = _number(1 / thing.tangential_mass(of_target))
+        functions.append(ca.Function("tangential_mobility", [target], [mobility]))
     return functions + (contact_functions(model.law, model.target) if method == "implicit" else [])
 
 
@@ -308,6 +312,7 @@ def shapes_out(collision: SteppedModel, outputs: tuple[str, ...], every: int) ->
         "velocity": (robot.nv, 1),
         "configuration": (robot.nq, 1),
         "target_result": (len(collision.target.results), 1),
+        "tangential_velocity": (3, 1),
     }
     for name in HISTORIES:
         rows = _rows(collision, name)
@@ -421,6 +426,7 @@ def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: T
         "KP_MATRIX": int(n > 0 and effects.stiffness and settings["kp"].ndim == 2),
         "SLIDES": int(model.slides),
         "BRISTLES": int(model.bristles),
+        "MOVES_TARGET": int(model.moves_target),
         "TINY": repr(TINY),
         "PEAK": int(model.peak),
         "STEP_ERROR": int(model.error),

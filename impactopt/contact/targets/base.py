@@ -18,7 +18,7 @@ UNITS = {"speed": "m_s", "depth": "m"}  # units of targets' results
 
 
 class Target(Described, ABC):
-    """A body that is hit and moves along the contact normal only. Before contact its speed is constant.
+    """A body that is hit and moves along the contact normal. Before contact its speed is constant.
 
     To write one, make a frozen dataclass whose fields are its parameters, and implement the methods below.
     They have to be smooth, except where one of `switches` changes its sign. `state` is a column of `n_states`
@@ -69,6 +69,10 @@ class Target(Described, ABC):
     @abstractmethod
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
         """Velocity of the hit surface along the normal [m/s]."""
+
+    def tangential_mass(self, parameters: Parameters | None = None) -> Any:
+        """Mass [kg] that friction accelerates across the normal; None: the target is held there."""
+        return None
 
     def speed_before(self, parameters: Parameters | None = None) -> Any:
         """Velocity of the surface along the normal [m/s] until contact begins; 0: at rest."""

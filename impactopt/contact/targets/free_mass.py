@@ -11,10 +11,10 @@ from impactopt.contact.targets.base import Target
 
 @dataclass(frozen=True, kw_only=True)
 class FreeMass(Target):
-    """A mass that moves freely along the normal.
+    """A mass that moves freely along the normal, and with friction's `moves_target` across it.
 
-    A point mass (paper, figs. 1 and 9); its state is the change of its velocity. It may come with a velocity,
-    as a ball does. Its result is `speed` [m/s], after the blow.
+    A point mass (paper, figs. 1 and 9); its state is the change of its velocity along the normal. It may come
+    with a velocity, as a ball does. Its result is `speed` [m/s] along the normal, after the blow.
     """
 
     word: ClassVar[str] = "free mass"
@@ -32,6 +32,9 @@ class FreeMass(Target):
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
         p = self.parameters if parameters is None else parameters
         return p["initial_velocity"] + state[0]
+
+    def tangential_mass(self, parameters: Parameters | None = None) -> Any:
+        return (self.parameters if parameters is None else parameters)["mass"]
 
     def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
         p = self.parameters if parameters is None else parameters

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.collision.settings import Effects, JointFriction, Settings, constant_reference, servo_settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
-from impactopt.contact.friction import check_friction
+from impactopt.contact.friction import check_friction, tangential_mobility
 from impactopt.errors import InputError, check_array, check_positive
 from impactopt.robots.robot import Robot
 
@@ -48,6 +48,7 @@ class Forces:
     viscous, coulomb, transition : joint friction, as in `JointFriction`.
     feedforward : (n,) [N m].
     velocity : (n,) [rad/s] at contact; the servo's reference starts with it.
+    mobility : [1/kg] of the target across the normal, see `tangential_mobility`.
     reference, reference_until : (n, k) [rad/s^(k + 1)], [s]: polynomial by which the reference's joint
         velocities change; see `Settings`.
     """
@@ -66,6 +67,7 @@ class Forces:
     velocity: Array
     reference: Array
     reference_until: float
+    mobility: float
 
     # ------------------------------------------------------------ joints
     def demand(self, time: float, moved: Array, velocity: Array) -> Array:
@@ -177,7 +179,7 @@ class ReferenceModel(CollisionModel):
         super().__post_init__()
         check_positive("step [s]", self.step)
         check_positive("tolerance", self.tolerance)
-        check_friction("contact_friction", self.contact_friction)
+        check_friction("contact_friction", self.contact_friction, self.target)
         self._settings(self.kp, self.kd)
 
     @abstractmethod
@@ -267,11 +269,12 @@ class ReferenceModel(CollisionModel):
         other = {name: x for name, x in overrides.items() if name not in ("kp", "kd")}
         values = settings.override(other)
         zero = np.zeros(n)
+        of_target = {name: float(values[f"target_{name}"]) for name in self.target.parameters}
         forces = Forces(
             law=self.law,
             target=self.target,
             law_parameters={name: float(values[f"contact_{name}"]) for name in self.law.parameters},
-            target_parameters={name: float(values[f"target_{name}"]) for name in self.target.parameters},
+            target_parameters=of_target,
             kp=values["kp"],
             kd=values["kd"],
             limit=values["torque_limit"],
@@ -282,6 +285,7 @@ class ReferenceModel(CollisionModel):
             velocity=v[-n:],
             reference=values["reference"],
             reference_until=float(values["reference_until"]),
+            mobility=tangential_mobility(self.contact_friction, self.target, of_target),
         )
         return forces, values["normal"]
 

@@ -23,6 +23,7 @@ from scipy.integrate import DOP853
 from scipy.optimize import brentq, minimize_scalar
 
 from impactopt.collision.interface import Collision
+from impactopt.contact.friction import UNBENT
 from impactopt.errors import InputError
 from impactopt.simulation.pinocchio_robot import Body
 from impactopt.simulation.reference.base import Forces, Phase
@@ -150,7 +151,8 @@ def _last_step(solver: DOP853, at: Any, phase: Phase) -> _Step:
 class Motion:
     """Motion from contact at q (nq,), v (nv,) on.
 
-    The state is y = (u (nv), v (nv), penetration, target's state, deflection of bristles (3,), impulse).
+    The state is y = (u (nv), v (nv), penetration, target's state, deflection of bristles (3,), velocity of
+    the target across the normal (3,) if friction moves it, impulse).
     """
 
     def __init__(self, body: Body, forces: Forces, q: Array, v: Array, horizon: float) -> None:
@@ -163,7 +165,10 @@ class Motion:
         end = 2 * body.nv + 1 + forces.target.n_states
         self.target_part = slice(2 * body.nv + 1, end)  # of the state
         self._bristle_part = slice(end, end + self._bristles)
-        self._start = np.concatenate([np.zeros(body.nv), v, np.zeros(end - 2 * body.nv + self._bristles + 1)])
+        self._moves = 3 if forces.mobility else 0
+        last = end + self._bristles + self._moves
+        self.tangential_part = slice(end + self._bristles, last)
+        self._start = np.concatenate([np.zeros(body.nv), v, np.zeros(last - 2 * body.nv + 1)])
         begin = self._state(0.0, self._start)
         self._scales = contact_scales(body, forces, begin.rate, horizon)
 
@@ -267,6 +272,7 @@ class Motion:
                 [scales.speed * scales.time],
                 scales.target,
                 np.full(self._bristles, scales.speed * scales.time),
+                np.full(self._moves, v),
                 [scales.impulse],
             ]
         )
@@ -366,10 +372,14 @@ class Motion:
         force = forces.contact(penetration, rate, phase.compressing) if phase.touching else 0.0
         torque = forces.torque(demand, phase)
         slope = np.empty_like(y)
-        if self._bristles and self.body.sliding is not None:
-            bent = y[self._bristle_part][None], np.array([force])
-            self.body.bend(*bent)
-            slope[self._bristle_part] = self.body.sliding.rates(*bent)[0]
+        if self.body.sliding is not None and self._bristles + self._moves:
+            deflection = y[self._bristle_part] if self._bristles else UNBENT
+            bent = deflection[None], np.array([force])
+            self.body.bend(*bent, y[self.tangential_part] if self._moves else np.zeros(3))
+            if self._moves:
+                slope[self.tangential_part] = forces.mobility * self.body.sliding.on_target(bent[1])
+            if self._bristles:
+                slope[self._bristle_part] = self.body.sliding.rates(*bent)[0]
         a = self.body.accelerate(torque - forces.friction(velocity, phase), force)
         slope[:nv] = y[nv : 2 * nv]
         if self._floating:  # du/dt = J_log(u) v; the other joints' coordinates are Euclidean
@@ -442,11 +452,13 @@ def collision_from(
     soles: int,
     forces: Forces,
     separated: bool,
+    tangential: Array,
 ) -> Collision:
     """Result of a simulated collision.
 
     instants : of its histories.  configuration, velocity, target : final q (nq,), v (nv,) and target state.
     impulse [N s], peak [N] : of the contact force.  soles : number of soles, the first of the fixed frames.
+    tangential : velocity (3,) [m/s] of the target across the normal, if friction moves it.
     """
     columns: dict[str, Any] = {
         name: np.array([getattr(i, name) for i in instants]) for name in Instant._fields
@@ -462,11 +474,14 @@ def collision_from(
         zmp = np.stack([-ground[:, 4], ground[:, 3]], axis=1) / ground[:, 2:3]
     kind, parameters = forces.target, forces.target_parameters
     at_rest = np.zeros(kind.n_states)
+    energy = float(kind.energy(target, parameters) - kind.energy(at_rest, parameters))
+    if forces.mobility:
+        energy += float(tangential @ tangential) / (2 * forces.mobility)
     return Collision(
         impulse=impulse,
         peak_force=peak,
         duration=instants[-1].time,
-        energy=float(kind.energy(target, parameters) - kind.energy(at_rest, parameters)),
+        energy=energy,
         separated=separated,
         velocity=velocity,
         configuration=configuration,
@@ -475,6 +490,7 @@ def collision_from(
         hand_wrench=wrench[:, soles:] if wrench.shape[1] > soles else None,
         ground_wrench=ground,
         zmp=zmp,
+        tangential_velocity=tangential if forces.mobility else None,
         freeze_error=0.0,
         **columns,
     )

@@ -79,5 +79,6 @@ class FullDynamics(ReferenceModel):
             len(self.held_by.sole_names(self.robot)),
             forces,
             run.separated,
+            run.final[motion.tangential_part].copy(),
         )
         return result, change

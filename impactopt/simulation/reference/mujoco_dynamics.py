@@ -99,7 +99,7 @@ class MujocoDynamics(ReferenceModel):
         """Collision in steps of this length [s]; `scales` as in `march`."""
         robot, frames, _, striker = self._body_arguments
         with no_log_file():
-            world = WeldedRobot(robot, frames, striker, step, self.contact_friction)
+            world = WeldedRobot(robot, frames, striker, step, self.contact_friction, forces.mobility)
             world.start(q, v)
             soles = len(self.held_by.sole_names(robot))
             return march(world, forces, normal, self.horizon, soles, scales)
@@ -125,6 +125,7 @@ class WeldedRobot(MujocoRobot):
         striker: str,
         step: float,
         friction: ContactFriction | None = None,
+        mobility: float = 0.0,
     ) -> None:
         mujoco, self.step = mujoco_module(), step
         spec = spec_of(robot, MujocoOptions(step, iterations=50, tolerance=0.0))
@@ -135,7 +136,7 @@ class WeldedRobot(MujocoRobot):
         if striker not in frames:
             frame = robot.model.frames[robot.model.getFrameId(striker)]
             bodies[frame.parentJoint].add_site(name=striker, pos=frame.placement.translation)
-        super().__init__(robot, spec.compile(), striker, friction=friction)
+        super().__init__(robot, spec.compile(), striker, friction=friction, mobility=mobility)
         self.welds = Welds(self.world, frames)
 
     def start(self, q: Array, v: Array) -> None:
@@ -214,7 +215,7 @@ def march(
         # a contact that begins with equal speeds of hand and target may still press: wait for the next step
         ends = (not phase.touching and (k > 0 or rate != 0)) or time >= horizon * (1 - 1e-9)
         if ends:
-            end = world.state()
+            end, tangential = world.state(), world.tangential[1]
         world.bend(np.array([force]), step)
         world.apply(torque - forces.friction(velocity, phase), force)
         world.mujoco.mj_step2(world.world, data)
@@ -225,7 +226,8 @@ def march(
                 Instant(time, force, depth, speed, target_speed, velocity, torque, demand, wrenches, places)
             )
         if ends:
-            return collision_from(instants, *end, impulse, peak, target, soles, forces, not phase.touching)
+            done = not phase.touching
+            return collision_from(instants, *end, impulse, peak, target, soles, forces, done, tangential)
         impulse += step * force
         # semi-implicit Euler as in MuJoCo: the travel follows from the new speed
         target = target + step * np.array(forces.target_rates(target, force), dtype=float)

@@ -253,6 +253,8 @@ def motion_of_record(
     wrench = np.asarray(arrays.get(f"{prefix}_sole_wrench", np.zeros((0, 0))))
     robot, legs_of_stance = problem.robot, [c.legs for c in problem.stance_coordinates]
     model, data = robot.model, robot.model.createData()
+    # Rounded cosines and sines are off the unit circle, and Pinocchio takes their small differences for zero.
+    q = np.array([pin.normalize(model, at) for at in q])
     # first column of each frame's wrench
     frames = [sole.frame for sole in problem.soles] if problem.stances else problem.coordinates.frames
     columns = {frame: 6 * k for k, frame in enumerate(frames)}

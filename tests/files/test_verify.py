@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from support.small_plans import arm_problem
 from typer.testing import CliRunner
 
 from impactopt import load_problem, load_record
@@ -213,3 +215,16 @@ def test_the_motion_is_looked_at_by_pinocchio(record: Record) -> None:
         other[f"reference_{name}"] = arrays[f"reference_{name}"] * 1.01 + 1e-3
         found = {what: by for what, by, _ in motion_of_record(problem, other) if by > 1e-5}
         assert f"reference: {word}" in found
+
+
+def test_a_continuous_joint_may_creep() -> None:
+    """Histories are rounded, and its cosine and sine are then off the unit circle."""
+    problem, time = arm_problem(), np.linspace(0.0, 0.1, 101)
+    start = problem.start_posture
+    v = np.zeros((len(time), problem.robot.nv))
+    v[:, 0] = 0.01
+    q = np.array([pin.integrate(problem.robot.model, start, t * v[0]) for t in time])
+    arrays = {"time": time, "phase": np.full(len(time), 2), "v": v, "a": 0 * v, "torque": 0 * v}
+    arrays["q"] = q.astype(np.float32).astype(float)
+    found = motion_of_record(problem, {f"reference_{name}": array for name, array in arrays.items()})
+    assert max(by for what, by, _ in found if what == "reference: rates") < 1e-6

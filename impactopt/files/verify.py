@@ -103,9 +103,11 @@ def verify_record(record: Record, problem: ImpactProblem, *, other_summary: bool
     InputError : it does not describe its program, or the description is damaged.
     """
     if "program_statement" not in record.arrays:
+        strike = "strike_posture" in record.arrays
+        why = "it is a strike, the impact alone" if strike else "it is of an impactopt before `verify`"
         raise InputError(
-            "this result has no description of its program's variables and constraints: it is a strike, or "
-            "of an impactopt before `verify`; solve again with `impactopt solve`"
+            f"this result has no description of its program's variables and constraints: {why}; solve again "
+            "with `impactopt solve`"
         )
     found = _Found()
     if other_summary:

@@ -14,11 +14,11 @@ import pytest
 from support.small_plans import arm_problem
 from typer.testing import CliRunner
 
-from impactopt import load_problem, load_record
+from impactopt import InputError, load_problem, load_record
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
 from impactopt.files.record import Record
-from impactopt.files.verify import motion_of_record
+from impactopt.files.verify import motion_of_record, verify_record
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 
@@ -184,7 +184,9 @@ def test_a_result_that_says_nothing_of_its_program(record: Record, tmp_path: Pat
     arrays = {name: a for name, a in record.arrays.items() if name != "program_statement"}
     save_record(dataclasses.replace(record, arrays=arrays), tmp_path)
     result = runner.invoke(app, ["verify", str(tmp_path)])
-    assert result.exit_code == 2 and "solve again" in result.output
+    assert result.exit_code == 2 and "before `verify`; solve again" in " ".join(result.output.split())
+    with pytest.raises(InputError, match="it is a strike, the impact alone"):
+        verify_record(dataclasses.replace(record, arrays={"strike_posture": np.zeros(3)}), load_problem(ARM))
 
 
 def test_a_result_of_another_program_is_said(record: Record, tmp_path: Path) -> None:

@@ -44,7 +44,8 @@ def ellipsoid(figure: FigureBase, record: Record) -> None:
     _over_angle(panels[-1], inverse, normal, largest)
     panels[-1].plot(0.0, mass, "o", color=VERMILION, markersize=4, zorder=4)
     figure.legend(*panels[-1].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    figure.suptitle(title(record, f"effective mass {mass:.1f} kg along the normal, drawn at {largest / REACH:.2g} kg/m"))
+    scale = f"drawn at {largest / REACH:.2g} kg/m"
+    figure.suptitle(title(record, f"effective mass {mass:.1f} kg along the normal, {scale}"))
 
 
 def _over_angle(axes: Any, inverse: Array, normal: Array, largest: float) -> None:

@@ -91,8 +91,6 @@ def export(
                 f"smoothed: {cost['impulse_Ns']:.3g} N s in our replay, of {cost['planned_impulse_Ns']:.3g} "
                 f"planned{meets}"
             )
-        if to == "mujoco":
-            typer.echo(f"\n{(directory / 'play.py').read_text(encoding='utf-8')}")
         if to in NEXT:
             typer.echo(printable(NEXT[to].format(directory=directory)))
 

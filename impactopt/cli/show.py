@@ -139,16 +139,17 @@ def _is_robot(what: Path) -> bool:
 def _result(result: Path, problem: Path | None) -> tuple[Page, Path]:
     """Page of a result, and its default path."""
     from impactopt.errors import InputError, did_you_mean
-    from impactopt.files.record import load_record
+    from impactopt.files.record import load_record, near_result
     from impactopt.files.replay import load_planned
     from impactopt.report.report import report_of
     from impactopt.robots.presets import robot_names
 
     if not os.path.exists(result):
         robots = robot_names()
+        near = near_result(result) or did_you_mean(str(result), robots)
         raise InputError(
-            f"there is no result {str(result)!r}{did_you_mean(str(result), robots)}; give a directory that "
-            f"`impactopt solve` wrote, a problem file, or one of the robots {', '.join(robots)}"
+            f"there is no result {str(result)!r}{near}; give a directory that `impactopt solve` wrote, "
+            f"a problem file, or one of the robots {', '.join(robots)}"
         )
     record = load_record(result)
     about = load_planned(result, problem_file=problem).problem if record.completed else None

@@ -80,6 +80,12 @@ class Collision:
     freeze_error: float = np.nan
     caution: str = ""
 
+    def __repr__(self) -> str:
+        """One line without arrays, which would fill pages."""
+        end = "" if self.separated else ", not separated"
+        size = f"{self.impulse:.4g} N s, {self.peak_force:.4g} N, {1e3 * self.duration:.4g} ms"
+        return f"<Collision: {size}{end}>"
+
     @classmethod
     def from_outputs(cls, found: dict[str, Array], target: Target) -> Collision:
         """Makes a result from the arrays of a collision function.

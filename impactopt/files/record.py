@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import json
 import os
 import tokenize
@@ -130,7 +131,8 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     except InputError:
         raise
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise InputError(f"there is no {path}; {fix}") from error
+        near = near_result(path.parent)
+        raise InputError(f"there is no {path}{near}; `impactopt solve NAME` writes results/NAME") from error
     except PermissionError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     # errors of NumPy and zipfile for files that are truncated, overwritten or of another kind
@@ -141,6 +143,13 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
         raise InputError(f"{path} is damaged ({error}); {fix}") from error
     problem_path = Path(os.path.normpath(path.parent.resolve() / relative)) if relative else None
     return Record(summary=summary, problem=problem, arrays=arrays, problem_path=problem_path)
+
+
+def near_result(directory: Path) -> str:
+    """Suggestion for a misspelt result, for the end of a message: " (did you mean 'results/x'?)", or ""."""
+    saved = {file.parent.name: file.parent for file in Path("results").glob(f"*/{NUMBERS}")}
+    near = difflib.get_close_matches(directory.name, saved, n=1)
+    return f" (did you mean {str(saved[near[0]])!r}?)" if near else ""
 
 
 def read_json(path: Path, most: int = LARGEST) -> dict[str, Any]:

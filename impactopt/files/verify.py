@@ -103,9 +103,11 @@ def verify_record(record: Record, problem: ImpactProblem, *, other_summary: bool
     InputError : it does not describe its program, or the description is damaged.
     """
     if "program_statement" not in record.arrays:
+        strike = "strike_posture" in record.arrays
+        why = "it is a strike, the impact alone" if strike else "it is of an impactopt before `verify`"
         raise InputError(
-            "this result has no description of its program's variables and constraints: it is a strike, or "
-            "of an impactopt before `verify`; solve again with `impactopt solve`"
+            f"this result has no description of its program's variables and constraints: {why}; solve again "
+            "with `impactopt solve`"
         )
     found = _Found()
     if other_summary:
@@ -253,6 +255,8 @@ def motion_of_record(
     wrench = np.asarray(arrays.get(f"{prefix}_sole_wrench", np.zeros((0, 0))))
     robot, legs_of_stance = problem.robot, [c.legs for c in problem.stance_coordinates]
     model, data = robot.model, robot.model.createData()
+    # Rounded cosines and sines are off the unit circle, and Pinocchio takes their small differences for zero.
+    q = np.array([pin.normalize(model, at) for at in q])
     # first column of each frame's wrench
     frames = [sole.frame for sole in problem.soles] if problem.stances else problem.coordinates.frames
     columns = {frame: 6 * k for k, frame in enumerate(frames)}

@@ -69,6 +69,11 @@ class LawFit:
     correlation: float
     aic: float
 
+    def __repr__(self) -> str:
+        """One line with the estimates."""
+        found = ", ".join(f"{name} {x.value:.4g} {x.unit}" for name, x in self.estimates.items())
+        return f"<{self.name}: {found}; residual {self.force_left_pct:.2g} % of the peak force>"
+
     @property
     def name(self) -> str:
         """Name of the law in problem files, or its class."""
@@ -143,6 +148,10 @@ class Identification:
     clipped: tuple[int, ...]
     top: float
     model_mass: tuple[float, ...] = field(default=())
+
+    def __repr__(self) -> str:
+        """One line with the best fit."""
+        return f"<Identification of {self.log!r}: best of {len(self.fits)} laws {self.best!r}>"
 
     @property
     def best(self) -> LawFit:

@@ -193,10 +193,11 @@ def inverse_kinematics(
     fid, point = hands[0]
     start = data.oMf[fid].translation
     names = " and ".join(f"'{name}'" for name, _ in aims)
+    fixed = " with the soles in place" if coordinates.legs else ""
     others = "".join(f" and {np.round(other, 4).tolist()} m" for _, other in hands[1:])
     raise InputError(
-        f"the point {np.round(point, 4).tolist()} m{others} is out of reach of {names} with the soles in "
-        f"place: the nearest posture found is off by {best_gap:.3g} m (the striking point starts at "
+        f"the point {np.round(point, 4).tolist()} m{others} is out of reach of {names}{fixed}: "
+        f"the nearest posture found is off by {best_gap:.3g} m (the striking point starts at "
         f"{np.round(start, 3).tolist()} m); move the point nearer"
     ) from None
 

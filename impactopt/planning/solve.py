@@ -210,6 +210,11 @@ def _program(
         if isinstance(start, str):
             return with_first_scale(t), start
         return t, check_array("start", start, (t.program.n,))
+    if start.problem.robot.joint_names != problem.robot.joint_names:
+        raise InputError(
+            f"start: a solution of the robot {start.problem.robot.name!r}, and the problem's is "
+            f"{problem.robot.name!r}; give one of the same robot"
+        )
     # a similar problem is likely to need the same lazy constraints and prices
     problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
     if problem.style == start.problem.style:

@@ -26,6 +26,8 @@ AHEAD = 2e-3  # [m] that a link may stick out beyond its striking point without 
 REACHED = 0.005  # [m] distance from the hit point of a posture that reaches it
 _ROUNDING = 1e-6  # of a torque limit, by the linear program
 PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers in a problem file
+LONG = 10.0  # [s] of a phase: longer ones are hard to believe
+HEAVY = 20.0  # mass of a target over the robot's, likewise
 DRAWN_POSTURES = 3  # initial guesses of inverse kinematics, beside the postures at start and at contact
 
 
@@ -94,6 +96,23 @@ def sticks_out(problem: ImpactProblem) -> list[str]:
         for striker, face in faces.items()
         if face is not None and face.ahead > AHEAD
     ]
+
+
+def unusual(problem: ImpactProblem) -> list[str]:
+    """Messages about durations and masses that look as if they were in another unit."""
+    phases = {"swing": problem.swing, "follow": problem.follow}
+    found = [
+        f"[{name}] duration_s is at least {phase.duration[0]:g}: an impact's motion takes about a second; is "
+        "it in milliseconds?"
+        for name, phase in phases.items()
+        if phase.duration[0] > LONG
+    ]
+    mass, robot = getattr(problem.target, "mass", np.inf), pin.computeTotalMass(problem.robot.model)
+    if HEAVY * robot < mass < np.inf:
+        found.append(
+            f"[target] mass_kg: {mass:g} kg is {mass / robot:.0f} times the robot's mass; is it in grams?"
+        )
+    return found
 
 
 def _out_of_balance(problem: ImpactProblem) -> str:

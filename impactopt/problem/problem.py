@@ -32,6 +32,7 @@ from impactopt.errors import (
     InputError,
     Mistakes,
     check_array,
+    check_kind,
     check_name,
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
@@ -199,6 +200,7 @@ class ImpactProblem:
     def __post_init__(self) -> None:
         # `attempt` collects the error of a check and returns False. A check that needs parts which have
         # failed is skipped, so that the message has independent mistakes only.
+        check_kind("robot", self.robot, Robot)
         mistakes = Mistakes()
         mistakes.attempt(lambda: check_name("the problem", self.name, empty=True))
         striker = mistakes.attempt(lambda: self.robot.striker(self.striker))

@@ -210,10 +210,10 @@ def _parts(comparison: Comparison) -> Iterator[str]:
     ):
         rows = [Row(d.key, tuple(map(Cell, d.values))) for d in differences]
         yield f"<h2>{heading}</h2>"
-        yield _table(comparison, rows) if rows else "<p>None.</p>"
+        yield _table(comparison, rows, kind="pairs") if rows else "<p>None.</p>"
 
 
-def _table(comparison: Comparison, rows: Sequence[Row]) -> str:
-    """HTML table with a column for each result."""
-    table = html_table(rows, ["", *comparison.records])
+def _table(comparison: Comparison, rows: Sequence[Row], *, kind: str = "") -> str:
+    """HTML table with a column for each result; kind : CSS class, "pairs" breaks long values."""
+    table = html_table(rows, ["", *comparison.records], kind=kind)
     return f'<section class="card"><div class="scroll" tabindex="0">{table}</div></section>'

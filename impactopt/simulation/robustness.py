@@ -7,7 +7,7 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,7 +127,7 @@ class Robustness:
     planned_impulse [N s] : of the plan
     """
 
-    perturbations: Sequence[Perturbation] = field(repr=False)
+    perturbations: Sequence[Perturbation]
     drawn_from: PerturbationRanges
     standing: NDArray[np.bool_]
     reason: Sequence[str]
@@ -135,6 +135,13 @@ class Robustness:
     slip: Array
     lift: Array
     planned_impulse: float
+
+    def __repr__(self) -> str:
+        """One line without arrays, which would fill pages."""
+        return (
+            f"<Robustness: {self.standing.sum()} of {self.draws} draws stand, {self.impulse_mean:.4g} N s of "
+            f"{self.planned_impulse:.4g} planned>"
+        )
 
     @property
     def draws(self) -> int:

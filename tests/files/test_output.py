@@ -141,6 +141,17 @@ def test_a_record_that_is_not_there(tmp_path: Path) -> None:
             load_record(place)
 
 
+def test_a_record_of_nearly_that_name_is_suggested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "results" / "punch").mkdir(parents=True)
+    (tmp_path / "results" / "punch" / "solution.npz").touch()
+    for name in ("punch", "results/pnch"):
+        with pytest.raises(InputError, match=r"did you mean 'results/punch'\?"):
+            load_record(name)
+    with pytest.raises(InputError, match=r"no kick/solution\.npz; `impactopt solve NAME`"):
+        load_record("kick")
+
+
 @pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04", b"\x93NUMPY\x01\x00v\x00{'descr': '<f8'"])
 def test_a_file_of_another_kind_is_damaged(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "solution.npz").write_bytes(content)

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from impactopt import InputError, Perturbation, Solution, load_record
 from impactopt.cli.app import app
 from impactopt.cli.validate import validate
+from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
 from impactopt.files.record import Record
 from impactopt.files.replay import Planned, Replay, load_planned, replay
@@ -82,6 +83,16 @@ def test_a_missed_blow_is_replayed_on_held_soles_too(saved: Path) -> None:
     assert report["torque_ratio_by_phase"].keys() == report["zmp_margin_by_phase_m"].keys()
     assert report["torque_ratio_by_phase"].keys() == {"swing", "missed"}
     assert report["torque_ratio"] < 1.05 and report["zmp_margin_m"] > 0
+
+
+def test_an_unsolved_plan_and_a_blow_that_does_not_hit_are_said(hammered: Solution, tmp_path: Path) -> None:
+    record = record_of(hammered, problem=problem_file("arm_planar").read_text("utf-8"))
+    save_record(record, tmp_path)
+    assert "not hit" not in run(tmp_path, "--step", "1e-4")[0]
+    bad = {**record.summary, "status": "time_limit", "message": "Stopped at the time limit."}
+    save_record(dataclasses.replace(record, summary=bad), tmp_path)
+    out, _ = run(tmp_path, "--distance", 0.2, "--step", "1e-4")
+    assert out.splitlines()[-2:] == ["Stopped at the time limit.", "the target is not hit"]
 
 
 def test_a_fall_exits_1_and_says_when(saved: Path) -> None:

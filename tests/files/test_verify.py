@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from support.small_plans import arm_problem
 from typer.testing import CliRunner
 
-from impactopt import load_problem, load_record
+from impactopt import InputError, load_problem, load_record
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
 from impactopt.files.record import Record
-from impactopt.files.verify import motion_of_record
+from impactopt.files.verify import motion_of_record, verify_record
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 
@@ -182,7 +184,9 @@ def test_a_result_that_says_nothing_of_its_program(record: Record, tmp_path: Pat
     arrays = {name: a for name, a in record.arrays.items() if name != "program_statement"}
     save_record(dataclasses.replace(record, arrays=arrays), tmp_path)
     result = runner.invoke(app, ["verify", str(tmp_path)])
-    assert result.exit_code == 2 and "solve again" in result.output
+    assert result.exit_code == 2 and "before `verify`; solve again" in " ".join(result.output.split())
+    with pytest.raises(InputError, match="it is a strike, the impact alone"):
+        verify_record(dataclasses.replace(record, arrays={"strike_posture": np.zeros(3)}), load_problem(ARM))
 
 
 def test_a_result_of_another_program_is_said(record: Record, tmp_path: Path) -> None:
@@ -213,3 +217,16 @@ def test_the_motion_is_looked_at_by_pinocchio(record: Record) -> None:
         other[f"reference_{name}"] = arrays[f"reference_{name}"] * 1.01 + 1e-3
         found = {what: by for what, by, _ in motion_of_record(problem, other) if by > 1e-5}
         assert f"reference: {word}" in found
+
+
+def test_a_continuous_joint_may_creep() -> None:
+    """Histories are rounded, and its cosine and sine are then off the unit circle."""
+    problem, time = arm_problem(), np.linspace(0.0, 0.1, 101)
+    start = problem.start_posture
+    v = np.zeros((len(time), problem.robot.nv))
+    v[:, 0] = 0.01
+    q = np.array([pin.integrate(problem.robot.model, start, t * v[0]) for t in time])
+    arrays = {"time": time, "phase": np.full(len(time), 2), "v": v, "a": 0 * v, "torque": 0 * v}
+    arrays["q"] = q.astype(np.float32).astype(float)
+    found = motion_of_record(problem, {f"reference_{name}": array for name, array in arrays.items()})
+    assert max(by for what, by, _ in found if what == "reference: rates") < 1e-6

@@ -74,6 +74,7 @@ def test_numbers_come_out_of_a_log_with_noise(law: str) -> None:
     assert found.best.undetermined == ()
     assert found.best.force_left_pct == pytest.approx(2.0, rel=0.2)  # the noise, and no more
     assert abs(found.best.correlation) < 0.3 < found.fits[-1].correlation
+    assert law in repr(found) and len(repr(found)) < 300  # no arrays
 
 
 @pytest.mark.parametrize("law", TRUE)

@@ -513,5 +513,5 @@ def test_a_reach_turns_the_hand(name: str) -> None:
 
 def test_out_of_reach_says_how_far_off() -> None:
     case = made("arm")
-    with pytest.raises(InputError, match=r"out of reach of 'hand'.*off by .*starts at"):
+    with pytest.raises(InputError, match=r"out of reach of 'hand': .*off by .*starts at"):
         inverse_kinematics(case.c, "hand", np.array([2.0, 0.0, 0.5]), case.posture)

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from impactopt import InputError, Solution
+from impactopt import FreeMass, InputError, Solution, VirtualMass, striking_velocity
 from impactopt.files.output import record_of
 
 
@@ -16,6 +16,12 @@ def test_a_solution_is_one_line(hammered: Solution) -> None:
     for thing in (solution.trajectory, solution.plan.collision, solution.plan.motion()):
         assert type(thing).__name__ in repr(thing) and len(repr(thing)) < 130
     assert len(repr(solution.validate())) < 600
+    p = solution.problem
+    scene = {"robot": p.robot, "striker": p.striker, "normal": p.normal, "law": p.law}
+    q = p.start_posture
+    v = striking_velocity(p.robot, q, p.striker, p.normal, 1.0)
+    hit = VirtualMass(**scene, target=FreeMass(mass=1.0)).collide(q, v)
+    assert f"{hit.impulse:.4g} N s" in repr(hit) and len(repr(hit)) < 130
 
 
 def test_a_motion_is_a_table_of_pandas(hammered: Solution, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,6 +29,7 @@ from impactopt import (
     InputError,
     PeakForce,
     Scenario,
+    Solution,
     Status,
     StrikeSolution,
     TorqueLimit,
@@ -431,8 +432,12 @@ def test_a_solution_starts_its_neighbour(
 
 
 def test_a_start_that_is_none_is_refused(
-    arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
+    arm_transcription: Transcription, hammered: Solution, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    with pytest.raises(
+        InputError, match="a solution of the robot 'planar_arm', and the problem's is 'small arm'"
+    ):
+        solve(arm_transcription.problem, start=hammered)
     with pytest.raises(InputError, match="did you mean 'strike'"):
         solve(arm_transcription.problem, start="strik")
     with pytest.raises(InputError, match="leave one of the two out"):

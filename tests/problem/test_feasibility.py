@@ -12,11 +12,11 @@ from support import urdfs
 from support.small_robots import arm, biped
 from typer.testing import CliRunner
 
-from impactopt import FixedBase, FreeMass, ImpactProblem, SpringDamper, load_problem
+from impactopt import FixedBase, FreeMass, ImpactProblem, Phase, SpringDamper, load_problem
 from impactopt.cli.app import app
 from impactopt.files.draft.drafting import draft_problem
 from impactopt.kinematics.support import margin, support_polygon
-from impactopt.problem.feasibility import hopeless, sticks_out
+from impactopt.problem.feasibility import hopeless, sticks_out, unusual
 from impactopt.problem.plausibility import doubts
 
 LAW, BALL = SpringDamper(stiffness=1e4, damping=100.0), FreeMass(mass=1.0)
@@ -62,6 +62,16 @@ def test_a_fixed_base_is_not_asked_for_balance() -> None:
         law=LAW, target=BALL, stance=FixedBase(), start="start",
     )  # fmt: skip
     assert [text for text in hopeless(problem) if "balance" in text] == []
+
+
+def test_numbers_that_look_like_another_unit_are_doubted() -> None:
+    problem = load_problem("arm_planar")
+    assert unusual(problem) == []
+    late, heavy = Phase(duration=800.0), FreeMass(mass=3000.0)
+    (said,) = unusual(dataclasses.replace(problem, swing=late))
+    assert said.startswith("[swing] duration_s") and "milliseconds" in said
+    (said,) = unusual(dataclasses.replace(problem, target=heavy))
+    assert said.startswith("[target] mass_kg: 3000 kg") and "grams" in said
 
 
 def test_joints_without_rotors_are_named() -> None:

@@ -233,6 +233,11 @@ def test_bad_input_is_named(robot: Robot, changes: dict[str, Any], says: str) ->
         problem(robot, **changes)
 
 
+def test_a_robot_by_its_name_is_none(robot: Robot) -> None:
+    with pytest.raises(InputError, match="robot must be a Robot, not 'standin'"):
+        dataclasses.replace(problem(robot), robot="standin")  # type: ignore[arg-type]
+
+
 def test_a_start_with_a_bad_configuration_is_named(robot: Robot) -> None:
     q = robot.posture("half_sitting")
     bad = q.copy()

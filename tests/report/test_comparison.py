@@ -157,19 +157,21 @@ def test_results_of_one_name_are_told_by_their_paths(records: dict[str, Record],
 
 
 def test_the_page_works_in_a_browser(records: dict[str, Record], tmp_path: Path) -> None:
-    path = compare(records).page().save(tmp_path / "page.html")
+    far = dataclasses.replace(records["one"], problem=PROBLEM_FILE.replace("talos", "/a" * 150))
+    path = compare({**records, "one": far}).page().save(tmp_path / "page.html")
     html = path.read_text(encoding="utf-8")
     assert "<two>" not in html.split('<div id="charts">')[0], "all text is escaped"
     assert {*re.findall(r"https?://[^\s\"'<>)]+", html)} == {"http://www.w3.org/2000/svg"}
     scripts = (
         "document.documentElement.scrollWidth <= innerWidth",
+        "[...document.querySelectorAll('.scroll')].every((s) => s.scrollWidth <= s.clientWidth)",
         "document.querySelectorAll('.chart path.line').length",
         "document.querySelectorAll('.chart')[0].querySelectorAll('.key').length",
     )
     seen: list[Any] = visit(Job(page=path, scripts=scripts), Job(page=path, width=400, scripts=scripts[:1]))
     assert [visit.console for visit in seen] == [[], []]
-    fits, lines, keys = seen[0].values
-    assert fits and seen[1].values == [True] and keys == 2 and lines >= 6
+    fits, whole, lines, keys = seen[0].values
+    assert fits and whole and seen[1].values == [True] and keys == 2 and lines >= 6
 
 
 def test_what_is_bolted_does_not_stand() -> None:

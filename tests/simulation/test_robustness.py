@@ -121,6 +121,7 @@ def test_impulses_are_of_all_draws_that_have_one() -> None:
     result = made_up([True, False, False], impulse=[12.0, 6.0, np.nan])
     assert result.rate == pytest.approx(1 / 3)
     assert (result.impulse_mean, result.impulse_std) == (9.0, 3.0)
+    assert "1 of 3 draws stand, 9 N s" in repr(result)
 
 
 def test_nothing_known_is_nan_without_a_warning() -> None:

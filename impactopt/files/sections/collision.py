@@ -113,7 +113,9 @@ class ProblemSection(Section):
     name: str = optional("name of the problem in reports")
     robot: Preset = optional("see `impactopt robots`; else a section [robot]")
     striker: str = required("the robot's striker")
-    point: Vector = required("hit point: x forward, y left, z up from the ground [m]", "point_m")
+    point: Vector = required(
+        "hit point: x forward, y left, z up from the ground, or from a fixed base [m]", "point_m"
+    )
     normal: UnitVector = required("direction in which the target is pushed")
     start: Posture = Field(
         default=USUAL_POSTURE,

@@ -9,7 +9,7 @@ from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from impactopt.files.record import Record
-from impactopt.report.pictures.style import BLACK, BLUE, GREEN, RIGHT, VERMILION, Array, picture, title
+from impactopt.report.pictures.style import BLACK, BLUE, GREEN, RIGHT, SKY, VERMILION, Array, picture, title
 
 # of each view: axes across and up, their labels, and its name
 VIEWS = (
@@ -44,7 +44,8 @@ def ellipsoid(figure: FigureBase, record: Record) -> None:
     _over_angle(panels[-1], inverse, normal, largest)
     panels[-1].plot(0.0, mass, "o", color=VERMILION, markersize=4, zorder=4)
     figure.legend(*panels[-1].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    figure.suptitle(title(record, f"effective mass {mass:.1f} kg along the normal"))
+    scale = f"drawn at {largest / REACH:.2g} kg/m"
+    figure.suptitle(title(record, f"effective mass {mass:.1f} kg along the normal, {scale}"))
 
 
 def _over_angle(axes: Any, inverse: Array, normal: Array, largest: float) -> None:
@@ -96,8 +97,8 @@ def _robot(axes: Any, record: Record, view: Array, largest: float) -> None:
     masses = _within(effective_masses(inverse, around), largest)
     curve = fist + scale * masses[:, None] * (around @ view.T)
     if np.isfinite(curve).all():
-        axes.fill(*curve.T, facecolor=BLUE, alpha=0.15, zorder=1)
-    axes.plot(*curve.T, color=BLUE, zorder=3)
+        axes.fill(*curve.T, facecolor=SKY, alpha=0.2, zorder=1)
+    axes.plot(*curve.T, color=SKY, zorder=3)
     tip = fist + scale * effective_masses(inverse, normal[None])[0] * (view @ normal)
     if np.linalg.norm(tip - fist) > 1e-3:
         arrow = {"arrowstyle": "-|>", "color": VERMILION, "linewidth": 1.4, "shrinkA": 0, "shrinkB": 0}

@@ -44,9 +44,9 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
     solids, world = _solids(problem), [p for p in surroundings_of(problem.world) if not _hides(p)]
     robots = [_joined([_placed(track, k, solid) for solid in solids]) for k in chosen]
     around = [_around(track, k, world, problem.normal) for k in chosen]
-    points = np.concatenate([robot[0].reshape(-1, 3) for robot in robots])
-    edges = np.percentile(points, [0.05, 99.95], axis=0)  # a stray vertex of a mesh may lie anywhere
-    edges = np.concatenate([edges, *(part[0].reshape(-1, 3) for parts in around for part in parts)])
+    # a stray vertex of a mesh may lie anywhere
+    within = [np.percentile(robot[0].reshape(-1, 3), [0.05, 99.95], axis=0) for robot in robots]
+    edges = np.concatenate([*within, *(part[0].reshape(-1, 3) for parts in around for part in parts)])
     ends = np.array([edges.min(axis=0) - 0.04, edges.max(axis=0) + 0.04])
     ends[0, 2] = min(ends[0, 2], problem.ground_height or 0.0) - 0.02
     sizes = [[np.ptp(ends @ np.abs(direction)) for direction in view[:2]] for _, view in VIEWS]

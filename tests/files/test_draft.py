@@ -271,6 +271,21 @@ def test_legs_of_five_and_seven_and_a_waist_stand(
     assert [leg.before.size for leg in problem.coordinates.legs] == [extra, extra]
 
 
+def test_a_hinge_is_in_the_middle_of_a_foot_that_is_inside_of_its_ankle(tmp_path: Path) -> None:
+    """Poppy's ankles are above the outer edges of its feet: there, no pressure keeps the margin."""
+    text = urdfs.biped(without="ankle_roll", inward=0.045)
+    robot = _problem(tmp_path, text).robot
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.posture("ready"))
+    for sole in robot.soles:
+        assert sole.polygon.min(axis=0) == pytest.approx(-sole.polygon.max(axis=0), abs=1e-3)
+        ankle, middle = (
+            data.oMf[robot.model.getFrameId(name)].translation
+            for name in (f"{sole.name}_ankle_pitch_link", sole.frame)
+        )
+        assert abs(middle[1]) == pytest.approx(abs(ankle[1]) - 0.045, abs=1e-3)
+
+
 def test_a_leg_of_five_stands_whose_axes_have_rounded_decimals(tmp_path: Path) -> None:
     """Five joints meet six constraints exactly only if all axes are."""
     text = urdfs.biped(without="ankle_roll")

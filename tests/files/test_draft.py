@@ -18,11 +18,13 @@ from typer.testing import CliRunner
 
 from impactopt import (
     Board,
+    FreeMass,
     ImpactProblem,
     InputError,
     Nail,
     Robot,
     Slide,
+    SpringDamper,
     Striker,
     Target,
     Tool,
@@ -269,6 +271,16 @@ def test_legs_of_five_and_seven_and_a_waist_stand(
     assert (knees > 0.3).all()
     extra = (shape.get("legs") == 7) + (shape.get("waist") is True)
     assert [leg.before.size for leg in problem.coordinates.legs] == [extra, extra]
+
+
+@pytest.mark.parametrize("text", [urdfs.biped(), urdfs.arm()], ids=["biped", "arm"])
+def test_the_contact_of_a_light_target_has_the_damping_ratio_of_the_papers(tmp_path: Path, text: str) -> None:
+    """The paper's: 300 N s/m, 1e4 N/m, 5 kg."""
+    problem = _problem(tmp_path, text)
+    law, target = problem.law, problem.target
+    assert isinstance(law, SpringDamper) and isinstance(target, FreeMass) and target.mass < 4.0
+    ratio = law.damping / np.sqrt(law.stiffness * target.mass)
+    assert ratio == pytest.approx(300.0 / np.sqrt(1e4 * 5.0), rel=0.05)  # written with two digits
 
 
 def test_a_hinge_is_in_the_middle_of_a_foot_that_is_inside_of_its_ankle(tmp_path: Path) -> None:

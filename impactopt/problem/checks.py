@@ -33,10 +33,10 @@ from impactopt.errors import (
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import ConstrainedDynamics
-from impactopt.kinematics.support import margin, support_polygon
+from impactopt.kinematics.support import margin, shrink, support_polygon
 from impactopt.problem.motion_style import STYLES
 from impactopt.problem.objectives import Penetration, TargetEnergy
-from impactopt.problem.terms import Grip, Term
+from impactopt.problem.terms import ContactWrenchCone, Grip, Term
 from impactopt.robots.checks import LEG, check_arms
 from impactopt.robots.gains import GainFactor, scaled_gains
 from impactopt.robots.robot import Robot
@@ -115,6 +115,27 @@ def check_stance(problem: Any) -> None:
         )
     hands = [(hand.name, hand.model_frame) for hand in stance.held_hands(robot)]
     check_arms(robot, stance.sole_frames(robot), hands)
+
+
+def check_hinges(problem: Any) -> None:
+    """InputError for a sole whose hinge leaves the centre of pressure no place.
+
+    A sole transmits no moment about its hinge, so the centre of pressure is on the hinge's axis.
+    """
+    cone = problem.term(ContactWrenchCone)
+    for sole in problem.soles:
+        across = {"x": 1, "y": 0}.get(sole.hinge)  # a hinge about z bounds no centre of pressure
+        if across is None:
+            continue
+        least = max(cone.margin, cone.collision_margin or 0.0)
+        ends = shrink(sole.polygon, least)[:, across]
+        if not min(ends) < 0 < max(ends):
+            raise InputError(
+                f"the centre of pressure of the sole {sole.name!r} is on its hinge, the {sole.hinge} axis "
+                f"of the frame {sole.frame!r}, which does not cross the sole at the margin of {least:g} m "
+                "from the edges: put the frame in the middle of the sole, or reduce the margins of "
+                "[terms.contact_wrench_cone]"
+            )
 
 
 def check_hands(problem: Any) -> None:

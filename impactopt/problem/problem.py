@@ -48,6 +48,7 @@ from impactopt.problem.checks import (
     check_elements,
     check_gains,
     check_hands,
+    check_hinges,
     check_moves,
     check_names,
     check_prices,
@@ -224,6 +225,7 @@ class ImpactProblem:
         sound = striker and stance and terms and mistakes.attempt(partial(check_second, self))
         if sound:
             mistakes.attempt(partial(check_hands, self))
+            mistakes.attempt(partial(check_hinges, self))
         sound = sound and mistakes.attempt(partial(check_strikers, self))
         if sound and aim and mistakes.attempt(lambda: self.contact_posture):
             mistakes.attempt(partial(check_moves, self))

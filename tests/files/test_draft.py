@@ -18,11 +18,13 @@ from typer.testing import CliRunner
 
 from impactopt import (
     Board,
+    FreeMass,
     ImpactProblem,
     InputError,
     Nail,
     Robot,
     Slide,
+    SpringDamper,
     Striker,
     Target,
     Tool,
@@ -269,6 +271,31 @@ def test_legs_of_five_and_seven_and_a_waist_stand(
     assert (knees > 0.3).all()
     extra = (shape.get("legs") == 7) + (shape.get("waist") is True)
     assert [leg.before.size for leg in problem.coordinates.legs] == [extra, extra]
+
+
+@pytest.mark.parametrize("text", [urdfs.biped(), urdfs.arm()], ids=["biped", "arm"])
+def test_the_contact_of_a_light_target_has_the_damping_ratio_of_the_papers(tmp_path: Path, text: str) -> None:
+    """The paper's: 300 N s/m, 1e4 N/m, 5 kg."""
+    problem = _problem(tmp_path, text)
+    law, target = problem.law, problem.target
+    assert isinstance(law, SpringDamper) and isinstance(target, FreeMass) and target.mass < 4.0
+    ratio = law.damping / np.sqrt(law.stiffness * target.mass)
+    assert ratio == pytest.approx(300.0 / np.sqrt(1e4 * 5.0), rel=0.05)  # written with two digits
+
+
+def test_a_hinge_is_in_the_middle_of_a_foot_that_is_inside_of_its_ankle(tmp_path: Path) -> None:
+    """Poppy's ankles are above the outer edges of its feet: there, no pressure keeps the margin."""
+    text = urdfs.biped(without="ankle_roll", inward=0.045)
+    robot = _problem(tmp_path, text).robot
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.posture("ready"))
+    for sole in robot.soles:
+        assert sole.polygon.min(axis=0) == pytest.approx(-sole.polygon.max(axis=0), abs=1e-3)
+        ankle, middle = (
+            data.oMf[robot.model.getFrameId(name)].translation
+            for name in (f"{sole.name}_ankle_pitch_link", sole.frame)
+        )
+        assert abs(middle[1]) == pytest.approx(abs(ankle[1]) - 0.045, abs=1e-3)
 
 
 def test_a_leg_of_five_stands_whose_axes_have_rounded_decimals(tmp_path: Path) -> None:

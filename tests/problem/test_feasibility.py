@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+import pytest
 from support import urdfs
+from support.small_plans import biped_problem
 from support.small_robots import arm, biped
 from typer.testing import CliRunner
 
-from impactopt import FixedBase, FreeMass, ImpactProblem, Phase, SpringDamper, load_problem
+from impactopt import FixedBase, FreeMass, ImpactProblem, InputError, Phase, SpringDamper, load_problem
 from impactopt.cli.app import app
 from impactopt.files.draft.drafting import draft_problem
 from impactopt.kinematics.support import margin, support_polygon
@@ -33,6 +36,17 @@ def _fist(problem: ImpactProblem) -> np.ndarray:
     data = model.createData()
     pin.framesForwardKinematics(model, data, problem.start_posture)
     return np.array(data.oMf[model.getFrameId(f"striker:{problem.striker}")].translation)
+
+
+@pytest.mark.parametrize(("out", "refused"), [(0.035, False), (0.045, True)])
+def test_a_hinge_within_the_margin_of_an_edge_is_refused(out: float, refused: bool) -> None:
+    """Soles 12 cm wide with a margin of 2 cm: the middle 8 cm may be on the hinge."""
+    robot = biped(5)
+    soles = [dataclasses.replace(sole, polygon=sole.polygon + np.array([0.0, out])) for sole in robot.soles]
+    robot = dataclasses.replace(robot, soles=soles)
+    mistake = r"'left' is on its hinge, the x axis .* margin of 0.02 m .* middle of the sole"
+    with pytest.raises(InputError, match=mistake) if refused else contextlib.nullcontext():
+        biped_problem(robot)
 
 
 def test_a_point_that_only_a_fall_reaches_is_out_of_balance() -> None:

@@ -78,12 +78,13 @@ def biped(
     effort: float = 80.0,
     pairs: int = 1,
     arms: bool = True,
+    inward: float = 0.0,
 ) -> str:
     """Two legs of so many joints with box feet, and two arms of three.
 
     without : one of these joints.  waist : one more joint, from the trunk to both legs.
     behind : its root looks along -x.  moments : of the right elbow's link.  effort : of all joints [N m].
-    pairs : of legs, one behind the other.  arms : False: none.
+    pairs : of legs, one behind the other.  arms : False: none.  inward [m] : of the feet, from the ankles.
     """
     sign = -1.0 if behind else 1.0
     parts = [link("trunk", 15.0, (0.2, 0.3, 0.5), (0.0, 0.0, 0.25))]
@@ -102,7 +103,7 @@ def biped(
                 place = (x - 0.4 * pair, out * 0.1 if parent == first else out * y, z)
                 size, at, mass = (0.08, 0.08, max(long, 0.06)), (0.0, 0.0, -long / 2), 1.0 + 5 * long
                 if name == ("ankle_roll" if without != "ankle_roll" else "ankle_pitch"):
-                    size, at, mass = (*SOLE, 0.04), (0.04 * sign, 0.0, -ANKLE + 0.02), 1.0
+                    size, at, mass = (*SOLE, 0.04), (0.04 * sign, -out * inward, -ANKLE + 0.02), 1.0
                 parts += [link(child, mass, size, at)]
                 parts += [joint(f"{mark}_{name}", parent, child, turn, place, limits, effort=effort)]
                 parent = child

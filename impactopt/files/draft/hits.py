@@ -19,6 +19,8 @@ from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
 MASS_RATIO = 0.06  # of a punched target to the robot
+MASSES = (0.5, 5.0)  # [kg] least and largest mass of a punched target
+PAPER_DAMPING = 300.0  # [N s/m] of the contact with the largest one
 FORCE_PER_MASS = 30.0  # [N/kg] of the robot: breaking force of a board, resistance of a nail
 MIN_FORCE, MAX_FORCE = 5.0, 600.0  # [N]
 FRACTIONS = (1.0, 0.5, 0.25)  # of that force, tried in this order
@@ -82,5 +84,8 @@ def hits(motion: str | None, robot: Robot) -> list[Hit]:
             )
             for force in forces
         ]
-    target = FreeMass(mass=float(f"{np.clip(MASS_RATIO * mass, 0.5, 5.0):.1g}"))
-    return [Hit(law=SpringDamper(stiffness=1e4, damping=300.0), target=target, normals=NORMALS)]
+    target = FreeMass(mass=float(f"{np.clip(MASS_RATIO * mass, *MASSES):.1g}"))
+    # The paper's contact has 300 N s/m and a target of 5 kg. With as much damping the first force on a small
+    # robot is many times its weight, so lighter targets get the same damping ratio.
+    damping = float(f"{PAPER_DAMPING * np.sqrt(target.mass / MASSES[1]):.2g}")
+    return [Hit(law=SpringDamper(stiffness=1e4, damping=damping), target=target, normals=NORMALS)]

@@ -65,6 +65,11 @@ def find_soles(
         x = _unit(x - up * (up @ x))  # forward in the plane of the sole
         place = pin.SE3(np.column_stack([x, np.cross(up, x), up]), low * up)
         corners = (flat - place.translation) @ place.rotation[:, :2]
+        if hinged := len(own) < LEG:
+            # The centre of pressure stays on the hinge's axis, which is through the middle of the sole: the
+            # ankle may be above an edge.
+            middle = (corners.max(axis=0) + corners.min(axis=0)) / 2
+            place, corners = place * pin.SE3(np.eye(3), np.append(middle, 0.0)), corners - middle
         polygon = _polygon(corners)
         if polygon is None:
             raise InputError(
@@ -79,7 +84,7 @@ def find_soles(
                 polygon=polygon,
                 parent=parent,
                 placement=_neat(above.inverse() * place),
-                hinge=None if len(own) >= LEG else _hinge(model, leg, own, place),
+                hinge=_hinge(model, leg, own, place) if hinged else None,
             )
         )
     return soles, forward

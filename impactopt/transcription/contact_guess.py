@@ -407,7 +407,7 @@ def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touc
         return _history.__wrapped__(law, target, mass, speed, touches)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=1024)  # an order of events takes up to 500
 def _history(law: ContactLaw, target: Target, mass: float, speed: float, touches: int) -> _History:
     """See `_integrated`."""
     of_law, of_target = law.parameters, target.parameters

@@ -41,8 +41,8 @@ DECAY = 2.0
 MIN_AHEAD = 0.25  # of the reach: a target is at least so far ahead of the base
 DOWN = np.array([0.0, 0.0, -1.0])
 AXES = (*map(np.array, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0))), DOWN)
-# ahead, to a side, down, and halfway between two of these; a problem's normal has a norm of 1 within 1e-6
-NORMALS = (*AXES, *(np.round(np.sqrt(0.5) * (a + b), 7) for a, b in combinations(AXES, 2) if not a @ b))
+# ahead, to a side, down, and halfway between two of these
+NORMALS = (*AXES, *(np.round(np.sqrt(0.5) * (a + b), 9) for a, b in combinations(AXES, 2) if not a @ b))
 MIN_COSINE = float(np.cos(np.radians(30)))  # between a normal and the line along which a single joint strikes
 # [m] farthest that a corner of the striking link may be beyond the target's plane, other than `FirstTouch`
 # allows, in a posture that is drawn: strikes that have to turn the link more are often not solved.

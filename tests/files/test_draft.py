@@ -444,7 +444,8 @@ def test_a_telescope_that_reaches_to_a_side_strikes_there(tmp_path: Path) -> Non
     parts += [urdfs.link("hand", 0.3, (0.05, 0.1, 0.05), (0.0, -0.05, 0.0))]
     parts += [urdfs.joint("wrist", parent, "hand", "0 0 1", (-0.1, -0.32, 0.0), (-1.0, 1.0), effort=5.0)]
     draft = _drafted(tmp_path, urdfs.robot("stretcher", *parts))
-    assert any("the drafted strike, along [0, -1, 0]" in line for line in draft.said), draft.said
+    assert any("the drafted strike, along [0, -1, 0] (to the right)" in line for line in draft.said)
+    assert "in which the target is pushed: to the right\n" in draft.text
     (tmp_path / "robot.toml").write_text(draft.text)
     problem = load_problem(tmp_path / "robot.toml")
     assert hopeless(problem) == [] and problem.point[1] < -0.3
@@ -452,7 +453,7 @@ def test_a_telescope_that_reaches_to_a_side_strikes_there(tmp_path: Path) -> Non
 
 def test_of_two_arms_the_other_one_waits_where_its_motors_hold_it(tmp_path: Path) -> None:
     draft = _drafted(tmp_path, _two_arms(), planned=True)
-    assert any("that have a whole motion" in line for line in draft.said)
+    said = next(line for line in draft.said if "that have a whole motion" in line)
     (tmp_path / "robot.toml").write_text(draft.text)
     problem = load_problem(tmp_path / "robot.toml")
     robot, q = problem.robot, problem.start_posture
@@ -463,7 +464,9 @@ def test_of_two_arms_the_other_one_waits_where_its_motors_hold_it(tmp_path: Path
     )
     left = [k for k, name in enumerate(robot.joint_names) if name.startswith("left")]
     assert (weight > robot.torque_limit)[left].any() and (asked <= 0.6 * robot.torque_limit)[left].all()
-    assert solve(problem).status.usable
+    solution = solve(problem)
+    assert solution.status.usable
+    assert float(said.split()[-3]) == pytest.approx(solution.impulse, rel=0.01)
 
 
 @pytest.mark.parametrize("still", [("turn", "wrist"), ("wrist",)])

@@ -513,7 +513,7 @@ def _aimed(
     for k, point in enumerate(points):
         if k == MAX_TARGETS:
             break
-        normal = (np.round(way, 7) + 0.0).tolist()
+        normal = (np.round(way, 9) + 0.0).tolist()
         problem = {"striker": striker, "point_m": point.tolist(), "normal": normal}
         aimed = {**data, "problem": {"name": data["problem"]["name"], **problem, "start": START}}
         try:

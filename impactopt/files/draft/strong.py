@@ -28,7 +28,7 @@ from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
 
 Array = NDArray[np.float64]
-MAX_STRIKES, MAX_CANDIDATES = 4, 60  # impacts solved as strikes; estimated impacts considered for them
+MAX_STRIKES, MAX_CANDIDATES = 6, 60  # impacts solved as strikes; estimated impacts considered for them
 MIN_DISTANCE, ALIKE = 0.2, 0.6  # of hit points, over the reach, if the cosine of their normals is larger
 # The start posture is that of contact, moved back at the contact velocity for so long [s], so that the joint
 # that moves farthest travels between these [rad], [m].

@@ -30,6 +30,7 @@ MAX_SWING = 1.2  # [rad], [m] travel of a joint from rest to contact
 LIMIT_MARGIN = 0.05  # of a joint's range, between a posture at contact and the joint's limits
 # postures with estimated impacts, and postures that are drawn for them at most, as most may not face a normal
 POSTURES, MAX_DRAWN = 1000, 20000
+MIN_POSTURES = 100  # with the link behind the target's plane; where there are fewer, others count, too
 POINT_POSTURES = 8  # postures at the hit point of a problem
 NEARBY = 0.4  # [m] from a problem's point
 # Attempts of `strongest_posture`. Measured on 17 targets of five arms: the best of 10 leads to a motion for
@@ -176,8 +177,9 @@ def drawn_impacts(
     rng, limb = np.random.default_rng(0), np.array(robot.limb(robot.striker(strength.striker).model_frame))
     low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
     low, high = low + LIMIT_MARGIN * (high - low), high - LIMIT_MARGIN * (high - low)
-    own, impacts = robot.joint_positions(q)[limb], list[EstimatedImpact]()
-    count = 0
+    own = robot.joint_positions(q)[limb]
+    # postures with directions: with the link behind the target's plane, and others that meet it face on
+    behind, others = list[tuple[Array, Sequence[Array]]](), list[tuple[Array, Sequence[Array]]]()
     for _ in range(MAX_DRAWN):
         step = np.zeros(robot.nv)
         step[robot.nv - robot.n + limb] = rng.uniform(low, high) - own
@@ -187,20 +189,20 @@ def drawn_impacts(
             tangent = np.reshape(jac, (6, robot.nv))[:3, robot.nv - robot.n + limb[0]]
             both = np.outer([1.0, -1.0], tangent / max(float(np.linalg.norm(tangent)), 1e-9))
             directions = [line for line in both if max(n @ line for n in normals) > MIN_COSINE]
+        near = directions
         if face is not None:
             pin.framesForwardKinematics(model, data, posture)
             own_frame = data.oMf[frame].rotation.T
-            directions = [
-                n
-                for n in directions
-                if face.normal @ (own_frame @ n) >= min_face_cosine
-                and float((face.corners @ (own_frame @ n)).max()) <= face.ahead + most
-            ]
-        if directions:
-            impacts += strength.at(posture, directions)
-            count += 1
-        if count == POSTURES:
+            directions = [n for n in directions if face.normal @ (own_frame @ n) >= min_face_cosine]
+            near = [n for n in directions if (face.corners @ (own_frame @ n)).max() <= face.ahead + most]
+        if len(near):
+            behind.append((posture, near))
+        elif len(directions) and len(others) < POSTURES:
+            others.append((posture, directions))
+        if len(behind) == POSTURES:
             break
+    chosen = behind if len(behind) >= MIN_POSTURES else [*behind, *others]
+    impacts = [impact for posture, directions in chosen for impact in strength.at(posture, directions)]
     reach = max((float(np.linalg.norm(impact.point[:2])) for impact in impacts), default=0.0)
     away = [b for b in impacts if np.linalg.norm(b.point[:2]) > MIN_AHEAD * reach and b.impulse > 0]
     # an arm may only reach to a side of its base, as Stretch's does

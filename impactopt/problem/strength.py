@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +29,8 @@ Array = NDArray[np.float64]
 MAX_SWING = 1.2  # [rad], [m] travel of a joint from rest to contact
 LIMIT_MARGIN = 0.05  # of a joint's range, between a posture at contact and the joint's limits
 # postures with estimated impacts, and postures that are drawn for them at most, as most may not face a normal
-POSTURES, MAX_DRAWN = 600, 6000
+POSTURES, MAX_DRAWN = 1000, 20000
+MIN_POSTURES = 100  # with the link behind the target's plane; where there are fewer, others count, too
 POINT_POSTURES = 8  # postures at the hit point of a problem
 NEARBY = 0.4  # [m] from a problem's point
 # Attempts of `strongest_posture`. Measured on 17 targets of five arms: the best of 10 leads to a motion for
@@ -39,8 +41,13 @@ ATTEMPTS = 12
 DECAY = 2.0
 MIN_AHEAD = 0.25  # of the reach: a target is at least so far ahead of the base
 DOWN = np.array([0.0, 0.0, -1.0])
-NORMALS = (*map(np.array, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0))), DOWN)
+AXES = (*map(np.array, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0))), DOWN)
+# ahead, to a side, down, and halfway between two of these
+NORMALS = (*AXES, *(np.round(np.sqrt(0.5) * (a + b), 9) for a, b in combinations(AXES, 2) if not a @ b))
 MIN_COSINE = float(np.cos(np.radians(30)))  # between a normal and the line along which a single joint strikes
+# [m] farthest that a corner of the striking link may be beyond the target's plane, other than `FirstTouch`
+# allows, in a posture that is drawn: strikes that have to turn the link more are often not solved.
+MAX_BEYOND = 1.5e-3
 STIFFNESS_DEPTH = 1e-3  # [m] penetration at which the secant stiffness of a law is taken
 
 
@@ -166,12 +173,13 @@ def drawn_impacts(
     model, data = robot.model, robot.model.createData()
     frame = model.getFrameId(robot.striker(strength.striker).model_frame)
     face = striker_face(robot, strength.striker) if with_face else None
-    min_face_cosine = float(np.cos(FirstTouch().angle))
+    min_face_cosine, most = float(np.cos(FirstTouch().angle)), FirstTouch().depth + MAX_BEYOND
     rng, limb = np.random.default_rng(0), np.array(robot.limb(robot.striker(strength.striker).model_frame))
     low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
     low, high = low + LIMIT_MARGIN * (high - low), high - LIMIT_MARGIN * (high - low)
-    own, impacts = robot.joint_positions(q)[limb], list[EstimatedImpact]()
-    count = 0
+    own = robot.joint_positions(q)[limb]
+    # postures with directions: with the link behind the target's plane, and others that meet it face on
+    behind, others = list[tuple[Array, Sequence[Array]]](), list[tuple[Array, Sequence[Array]]]()
     for _ in range(MAX_DRAWN):
         step = np.zeros(robot.nv)
         step[robot.nv - robot.n + limb] = rng.uniform(low, high) - own
@@ -181,15 +189,20 @@ def drawn_impacts(
             tangent = np.reshape(jac, (6, robot.nv))[:3, robot.nv - robot.n + limb[0]]
             both = np.outer([1.0, -1.0], tangent / max(float(np.linalg.norm(tangent)), 1e-9))
             directions = [line for line in both if max(n @ line for n in normals) > MIN_COSINE]
+        near = directions
         if face is not None:
             pin.framesForwardKinematics(model, data, posture)
-            face_normal = data.oMf[frame].rotation @ face.normal
-            directions = [n for n in directions if n @ face_normal >= min_face_cosine]
-        if directions:
-            impacts += strength.at(posture, directions)
-            count += 1
-        if count == POSTURES:
+            own_frame = data.oMf[frame].rotation.T
+            directions = [n for n in directions if face.normal @ (own_frame @ n) >= min_face_cosine]
+            near = [n for n in directions if (face.corners @ (own_frame @ n)).max() <= face.ahead + most]
+        if len(near):
+            behind.append((posture, near))
+        elif len(directions) and len(others) < POSTURES:
+            others.append((posture, directions))
+        if len(behind) == POSTURES:
             break
+    chosen = behind if len(behind) >= MIN_POSTURES else [*behind, *others]
+    impacts = [impact for posture, directions in chosen for impact in strength.at(posture, directions)]
     reach = max((float(np.linalg.norm(impact.point[:2])) for impact in impacts), default=0.0)
     away = [b for b in impacts if np.linalg.norm(b.point[:2]) > MIN_AHEAD * reach and b.impulse > 0]
     # an arm may only reach to a side of its base, as Stretch's does
@@ -252,9 +265,9 @@ def touches(problem: ImpactProblem, *postures: Array) -> bool:
 def best_share(problem: ImpactProblem) -> tuple[float, EstimatedImpact] | None:
     """Estimated impulse of a problem over that of the hardest impact nearby, and that impact.
 
-    Nearby are points within 0.4 m, hit along the problem's normal, to the front, to a side or down. The
-    result is rough: postures are drawn, and clearance is ignored. None for a robot on soles, whose balance
-    limits the impulse, and for targets other than a free mass.
+    Nearby are points within 0.4 m, hit along the problem's normal, or one of `NORMALS`. The result is
+    rough: postures are drawn, and clearance is ignored. None for a robot on soles, whose balance limits the
+    impulse, and for targets other than a free mass.
     """
     p = problem
     if p.robot.floating or p.second is not None or not isinstance(p.target, FreeMass):

@@ -362,6 +362,7 @@ INERTIAS = (GIVEN, REPAIRED)
 TRIANGLE_TOLERANCE = 1e-3
 MIN_THICKNESS = 0.01  # [m] of a repaired body, along each principal axis
 BALL_DENSITY = 2000.0  # [kg/m3] of the ball that replaces a point mass: motors, gears and housing
+MIN_EXTENT = 3.0  # [m] of a robot, when the largest inertia that one of its links can have is estimated
 _FIX = f'correct its <inertial>, with moments about the centre of mass, or take inertias="{REPAIRED}"'
 
 
@@ -373,15 +374,28 @@ def _is_between_joints(model: pin.Model, i: int) -> bool:
 
 def check_inertias(model: pin.Model) -> None:
     """InputError with all moving bodies whose mass or inertia is not physical."""
-    found = Mistakes()
+    found, largest = Mistakes(), _largest_inertia(model)
     for i in range(1, model.njoints):
         if not _is_between_joints(model, i):
-            found.found += _inertia_mistake(model, i)
+            found.found += _inertia_mistake(model, i, largest)
     found.raise_if_any(f"the robot {model.name!r}")
 
 
-def _inertia_mistake(model: pin.Model, i: int) -> Iterator[str]:
-    """Message about the first physically impossible property of the body of joint i, if there is one."""
+def _largest_inertia(model: pin.Model) -> float:
+    """Moment of inertia [kg m2] that no link exceeds: that of all moving mass, as far away as joints and
+    centres of mass in one line, or `MIN_EXTENT`. Moments in g mm2 or kg mm2 are larger.
+    """
+    bodies, places = list(model.inertias)[1:], list(model.jointPlacements)[1:]
+    steps = [*(body.lever for body in bodies), *(place.translation for place in places)]
+    extent = max(sum(float(np.linalg.norm(step)) for step in steps), MIN_EXTENT)
+    return sum(float(body.mass) for body in bodies) * extent**2
+
+
+def _inertia_mistake(model: pin.Model, i: int, largest: float) -> Iterator[str]:
+    """Message about the first physically impossible property of the body of joint i, if there is one.
+
+    largest : of `_largest_inertia`.
+    """
     body = model.inertias[i]
     root = model.joints[i].nq == 7  # a free-flyer, which has no joint in the file
     link = _root(model) if root else f"the link moved by joint {model.names[i]!r}"
@@ -412,6 +426,11 @@ def _inertia_mistake(model: pin.Model, i: int) -> Iterator[str]:
                 f"{where} has principal moments of inertia {moments}: one exceeds the sum of the others, "
                 f"which no body has; {_FIX}"
             )
+        elif large > largest:
+            yield (
+                f"{where} has principal moments of inertia {moments}, more than all of the robot's mass can "
+                f"have: are they in g mm2 or kg mm2? {_FIX[0].upper()}{_FIX[1:]}"
+            )
 
 
 def _root(model: pin.Model) -> str:
@@ -425,10 +444,10 @@ def repair_inertias(model: pin.Model) -> list[str]:
     """Change inertias that no body of this mass can have, in place; messages about the changes.
 
     Mass and centre of mass stay. The second moments of mass along the principal axes are raised to those of a
-    slab 1 cm thick. If all three are smaller than that, the body becomes a ball of 2000 kg/m3. Other physical
-    inertias are not changed.
+    slab 1 cm thick. If all three are smaller than that, or a moment is larger than all of the robot's mass
+    can have, the body becomes a ball of 2000 kg/m3. Other physical inertias are not changed.
     """
-    messages = []
+    messages, largest = [], _largest_inertia(model)
     for i in range(1, model.njoints):
         body = model.inertias[i]
         if not (0 < body.mass <= HEAVIEST and np.isfinite(np.array(body.inertia)).all()):
@@ -438,18 +457,18 @@ def repair_inertias(model: pin.Model) -> list[str]:
         # inequality of its moments of inertia.
         second = moments.sum() / 2 - moments
         least = body.mass * MIN_THICKNESS**2 / 12
-        point = bool((second < least).all())
-        if not point and moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - TRIANGLE_TOLERANCE):
+        ball = bool((second < least).all()) or moments[2] > largest
+        if not ball and moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - TRIANGLE_TOLERANCE):
             continue
-        if point:
+        if ball:
             radius_squared = (3 * body.mass / (4 * np.pi * BALL_DENSITY)) ** (2 / 3)
             second = np.full(3, body.mass / 5 * radius_squared)
         second = np.maximum(second, least)
         new = second.sum() - second
         model.inertias[i] = pin.Inertia(
-            body.mass, np.array(body.lever), axes @ np.diag(new) @ axes.T if not point else np.diag(new)
+            body.mass, np.array(body.lever), axes @ np.diag(new) @ axes.T if not ball else np.diag(new)
         )
-        how = f"a ball of {BALL_DENSITY:g} kg/m3" if point else "the nearest that a body can have"
+        how = f"a ball of {BALL_DENSITY:g} kg/m3" if ball else "the nearest that a body can have"
         messages.append(
             f"the link moved by joint {model.names[i]!r}, {body.mass:.3g} kg: {_three(moments)} became "
             f"{_three(np.sort(new))} kg m2, {how}"

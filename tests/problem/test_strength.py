@@ -6,9 +6,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impactopt import HandOrientation, load_problem, solve
+from impactopt import FirstTouch, HandOrientation, load_problem, solve
+from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.strength import strongest_posture, touches
+from impactopt.problem.strength import MAX_BEYOND, Strength, drawn_impacts, strongest_posture, touches
 from impactopt.transcription import initial_guess
 
 
@@ -59,3 +60,23 @@ def test_a_solve_searches_its_posture_once(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(initial_guess, "strongest_posture", counted)
     assert solve(load_problem("arm7")).status.usable and searched == [0]
+
+
+def test_drawn_postures_turn_the_links_face_to_the_normal() -> None:
+    """No vertex of the link is farther beyond the target's plane, at any normal, oblique ones too."""
+    problem = load_problem("arm7")
+    robot, name = problem.robot, problem.striker
+    impacts = drawn_impacts(
+        Strength(robot=robot, striker=name, law=problem.law, target=problem.target), problem.start_posture
+    )
+    striker, data, face = robot.striker(name), robot.model.createData(), striker_face(robot, name)
+    assert face is not None
+    joint = robot.model.frames[robot.model.getFrameId(striker.frame)].parentJoint
+    pieces = bodies_of(robot).of_joint[int(joint)]
+    vertices = np.concatenate([piece.vertices for piece in pieces if not piece.assumed])
+    for impact in impacts:
+        pin.forwardKinematics(robot.model, data, impact.q)
+        along = (np.array([data.oMi[joint].act(v) for v in vertices]) - impact.point) @ impact.normal
+        assert along.max() <= face.ahead + FirstTouch().depth + MAX_BEYOND + 1e-9
+        assert np.linalg.norm(impact.normal) == pytest.approx(1.0, abs=1e-8)
+    assert len({np.count_nonzero(impact.normal) for impact in impacts}) == 2

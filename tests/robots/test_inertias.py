@@ -11,7 +11,7 @@ from support import urdfs
 
 from impactopt import InputError, Robot
 from impactopt.files.problem_file import problem_file_from_data
-from impactopt.robots.checks import repair_inertias
+from impactopt.robots.checks import check_inertias, repair_inertias
 
 LOST = 'ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"'
 FLAT = 'ixx="0.001" iyy="0.002" izz="0.01" ixy="0" ixz="0" iyz="0"'
@@ -45,6 +45,18 @@ def test_a_point_becomes_a_ball() -> None:
     radius = (3 * 3.0 / (4 * np.pi * 2000.0)) ** (1 / 3)
     assert np.allclose(model.inertias[1].inertia, pin.Inertia.FromSphere(3.0, radius).inertia)
     assert "'hinge'" in said[0] and "3 kg" in said[0] and "ball" in said[0]
+
+
+@pytest.mark.parametrize("unit", [1e6, 1e9], ids=["kg mm2", "g mm2"])
+def test_moments_in_another_unit_are_refused_and_become_those_of_a_ball(unit: float) -> None:
+    true = pin.Inertia.FromBox(0.2, 0.1, 0.1, 0.2)  # [kg], [m]
+    model = _model(0.2, list(unit * np.diag(true.inertia)))
+    with pytest.raises(InputError, match=r"'hinge'.* g mm2"):
+        check_inertias(model)
+    assert "ball" in repair_inertias(model)[0]
+    check_inertias(model)
+    radius = (3 * 0.2 / (4 * np.pi * 2000.0)) ** (1 / 3)
+    assert np.allclose(model.inertias[1].inertia, pin.Inertia.FromSphere(0.2, radius).inertia)
 
 
 @pytest.mark.parametrize("moments", [[0.01, 0.02, 0.025], [0.01, 0.01, 0.02], [1e-4, 1e-4, 1e-4]])

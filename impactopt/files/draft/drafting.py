@@ -48,6 +48,10 @@ from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
 MAX_TARGETS = 8  # tried
+MAX_MOTIONS = 2  # whole motions of a bolted arm that are compared
+# A strike is planned for if its objective is at least so much of the hardest motion's.
+WORTH_A_PLAN = 1.05
+SLIGHT = 0.35  # component of a direction that is not named in words: 20 degrees
 MAX_STROKES = 3  # targets of a robot on legs, below its hand, that a strike is tried to
 SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # durations [s] for fast robots
 SHIFT = (0.6, 1.2)  # duration [s] from two feet to one, and back
@@ -200,19 +204,22 @@ def _bolted(
         strong, hit, edgewise, _ = _hardest(other, with_peg, q, targets)
         robot, arms = (other, [with_peg, *arms[1:]]) if strong else (robot, arms)
     if strong:
-        striking, count = arms[0], len(strong)
+        striking = arms[0]
 
         @cache
         def data_of(k: int) -> dict[str, Any]:
             return _strike_data(drafted, robot, strikers, striking, strong[k], hit, edgewise, folder)
 
-        taken = _first_planned(data_of, count, folder, say) if planned else 0
-        data = data_of(taken or 0)
-        if taken is None:
-            taken = _first_planned(lambda k: _slower(data_of(k)), count, folder, say)
-            data = _slower(data_of(taken or 0))
-        result = _strike_message(strong[taken or 0], found=taken is not None, tried=planned)
-        messages = [result, *([EDGEWISE] if edgewise else []), *([PEGGED] if pegged else [])]
+        best = _hardest_planned(data_of, strong, folder, say) if planned else None
+        data = data_of(best[0] if best else 0)
+        if planned and not best:
+            best = _hardest_planned(lambda k: _slower(data_of(k)), strong, folder, say)
+            data = _slower(data_of(best[0] if best else 0))
+        messages = [
+            _strike_message(strong, best, tried=planned),
+            *([EDGEWISE] if edgewise else []),
+            *([PEGGED] if pegged else []),
+        ]
     else:
         try:
             q, way = ready(
@@ -385,33 +392,47 @@ def _kick(
     return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
 
 
-def _first_planned(
-    data_of: Callable[[int], dict[str, Any]], count: int, folder: Path, say: Callable[[str], None]
-) -> int | None:
-    """Index of the first of so many data for which a whole motion is solved; None if there is none.
+def _hardest_planned(
+    data_of: Callable[[int], dict[str, Any]], strong: list[Strong], folder: Path, say: Callable[[str], None]
+) -> tuple[int, float] | None:
+    """Index of the strike with the hardest motion, of at most `MAX_MOTIONS` that are solved, and the motion's
+    objective; None if none is solved.
 
-    A solved strike may have no motion, as links may be beyond the target's plane just before it.
+    A solved strike may have no motion, as links may be beyond the target's plane just before it. A motion is
+    hardly ever harder than its strike, so the search ends at a strike that is weaker than the best motion.
     """
-    for k in range(count):
-        say(f"planning the motion to strike {k + 1} of {count}")
+    found = list[tuple[float, int]]()
+    for k, strike in enumerate(strong):
+        if len(found) == MAX_MOTIONS or (found and strike.objective < WORTH_A_PLAN * max(found)[0]):
+            break
+        say(f"planning the motion to strike {k + 1} of {len(strong)}")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a failed trial is no result
             with contextlib.suppress(InputError):
                 problem = _built(data_of(k), folder)
                 solution = solve(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
                 if solution.status.usable:
-                    return k
-    return None
+                    found.append((sum(solution.objectives.values()), k))
+    return (max(found)[1], max(found)[0]) if found else None
 
 
-def _strike_message(strong: Strong, *, tried: bool, found: bool) -> str:
-    normal = ", ".join(f"{x:g}" for x in strong.normal)
-    with_motion = " that have a whole motion" if tried and found else ""
-    none = "; no whole motion to it, or to another one, was found" if not found else ""
+def _strike_message(strong: list[Strong], best: tuple[int, float] | None, *, tried: bool) -> str:
+    """Message about the drafted strike; best : of `_hardest_planned`, if that was `tried`."""
+    k, objective = best or (0, strong[0].objective)
+    normal = ", ".join(f"{x:.3g}" for x in strong[k].normal)
+    with_motion = " that have a whole motion" if best else ""
+    none = "; no whole motion to it, or to another one, was found" if tried and not best else ""
     return (
-        f"the drafted strike, along [{normal}], is the hardest of those tried{with_motion}: "
-        f"{strong.objective:.3g} {strong.unit}{none}"
+        f"the drafted strike, along [{normal}] ({_in_words(strong[k].normal)}), is the hardest of those "
+        f"tried{with_motion}: {objective:.3g} {strong[k].unit}{none}"
     )
+
+
+def _in_words(direction: Array) -> str:
+    """Direction (3,) in words, such as "ahead and down"."""
+    words = (("ahead", "back"), ("to the left", "to the right"), ("up", "down"))
+    named = zip(direction, words, strict=True)
+    return " and ".join(pair[int(x < 0)] for x, pair in named if abs(x) > SLIGHT)
 
 
 def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
@@ -492,7 +513,8 @@ def _aimed(
     for k, point in enumerate(points):
         if k == MAX_TARGETS:
             break
-        problem = {"striker": striker, "point_m": point.tolist(), "normal": (way + 0.0).tolist()}
+        normal = (np.round(way, 9) + 0.0).tolist()
+        problem = {"striker": striker, "point_m": point.tolist(), "normal": normal}
         aimed = {**data, "problem": {"name": data["problem"]["name"], **problem, "start": START}}
         try:
             built = _built(aimed, folder)
@@ -534,6 +556,8 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
             return guessed[str(place[1])]
         if place == ("robot", "postures_rad", START):
             return "soles level, knees forward, arms bent" if data["robot"].get("soles") else "bent"
+        if place == ("problem", "normal"):
+            return f"{comment_at(data, place)}: {_in_words(np.array(data['problem']['normal']))}"
         return comment_at(data, place)
 
     def hidden(place: Place) -> Mapping[str, Any]:

@@ -28,8 +28,8 @@ from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
 
 Array = NDArray[np.float64]
-MAX_STRIKES, MAX_CANDIDATES = 4, 60  # impacts solved as strikes; estimated impacts considered for them
-MIN_DISTANCE = 0.2  # of hit points with the same normal, over the reach
+MAX_STRIKES, MAX_CANDIDATES = 6, 60  # impacts solved as strikes; estimated impacts considered for them
+MIN_DISTANCE, ALIKE = 0.2, 0.6  # of hit points, over the reach, if the cosine of their normals is larger
 # The start posture is that of contact, moved back at the contact velocity for so long [s], so that the joint
 # that moves farthest travels between these [rad], [m].
 RUN_UP, TRAVEL = 0.7, (0.35, 0.9)
@@ -124,7 +124,7 @@ def _candidates(
     reach = max((float(np.linalg.norm(impact.point)) for impact in impacts), default=0.0)
     taken: list[EstimatedImpact] = []
     for impact in impacts[:MAX_CANDIDATES]:
-        near = [b for b in taken if b.normal @ impact.normal > 0.9]
+        near = [b for b in taken if b.normal @ impact.normal > ALIKE]
         if any(np.linalg.norm(b.point - impact.point) < MIN_DISTANCE * reach for b in near):
             continue
         problem = _problem(robot, arm, impact, min(BEHIND[0], BEHIND[1] * reach), given, clipped)

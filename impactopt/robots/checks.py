@@ -362,7 +362,7 @@ INERTIAS = (GIVEN, REPAIRED)
 TRIANGLE_TOLERANCE = 1e-3
 MIN_THICKNESS = 0.01  # [m] of a repaired body, along each principal axis
 BALL_DENSITY = 2000.0  # [kg/m3] of the ball that replaces a point mass: motors, gears and housing
-MIN_EXTENT = 3.0  # [m] of a robot, when the largest inertia that one of its links can have is estimated
+MIN_EXTENT = 10.0  # [m] of a robot, when the largest inertia that one of its links can have is estimated
 _FIX = f'correct its <inertial>, with moments about the centre of mass, or take inertias="{REPAIRED}"'
 
 

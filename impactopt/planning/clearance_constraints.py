@@ -176,10 +176,9 @@ class Watch:
         neighbours = self._shapes.between < NEIGHBOUR_JOINTS
         self._include = np.where(neighbours, INCLUDE_NEIGHBOURS, INCLUDE)
         self._trigger = np.where(neighbours, TRIGGER_NEIGHBOURS, TRIGGER)
-        # the last iterate, its placements and gaps
-        self._x, self._at = x.copy(), self._placed(x)
-        within = np.where(self._has, 0.0, TRIGGER)
-        self._found = self._at, self._shapes.look(self._at, within, self._directions, margins.wanted)
+        self._x = x.copy()
+        # placements and gaps at the last iterate
+        self._found = self._gaps_at(self._placed(x), self._directions, None)
         # the last accepted trial: variables, directions, placements and gaps
         self._next: tuple[Array, Array, tuple[Placed, Looked]] | None = None
         self._interruptions, self.left = 0, False
@@ -191,7 +190,7 @@ class Watch:
 
         within [m] : distance that is near; neighbouring links are near at a proportional part of it.
         """
-        near = self._gaps_at(self._at, self._directions, within)[1]
+        near = self._gaps_at(self._found[0], self._directions, self._found, within)[1]
         new = (near.gap < within / INCLUDE * self._include[near.pair]) & ~self._has[near.spot, near.pair]
         out = Constraints()
         for k, n in zip(near.spot[new].tolist(), near.pair[new].tolist(), strict=True):
@@ -224,7 +223,7 @@ class Watch:
         for _ in range(_MAX_HALVINGS):
             trial = x + length * step
             directions = self._directions.copy()
-            found = self._gaps_at(self._placed(trial), directions)
+            found = self._gaps_at(self._placed(trial), directions, here)
             clear = not self._violates_clearance(here[1], found[1])
             if clear and not self._passes(x + 0.5 * length * step, here, found):
                 self._next = trial, directions, found
@@ -243,8 +242,8 @@ class Watch:
         if self._next is not None and np.array_equal(self._next[0], x):
             _, self._directions, self._found = self._next
         else:
-            self._found = self._gaps_at(self._placed(x), self._directions)
-        self._x, self._at, self._next = x.copy(), self._found[0], None
+            self._found = self._gaps_at(self._placed(x), self._directions, self._found)
+        self._x, self._next = x.copy(), None
 
     def _placed(self, x: Array) -> Placed:
         c, ny = self._t.coordinates, self._t.builder.ny
@@ -252,14 +251,16 @@ class Watch:
         q = c.join(z[:, :ny], z[:, ny:])
         return self._margins.bodies.placed(Places.of(self._t.robot, q, self._travel, self._phase))
 
-    def _gaps_at(self, at: Placed, directions: Array, within: float = TRIGGER) -> tuple[Placed, Looked]:
+    def _gaps_at(
+        self, at: Placed, directions: Array, before: tuple[Placed, Looked] | None, within: float = TRIGGER
+    ) -> tuple[Placed, Looked]:
         """Gaps of all pairs; updates directions in place.
 
         Those without a constraint are exact if less than ``within``. The others are lower bounds, by how far
         the bodies have moved, while these are positive: the program keeps such pairs apart.
         """
         exact_within = np.where(self._has, 0.0, within)
-        return at, self._shapes.look(at, exact_within, directions, self._margins.wanted, self._found)
+        return at, self._shapes.look(at, exact_within, directions, self._margins.wanted, before)
 
     # ------------------------------------------------------------------ clearance violations
     def _bare(self, found: Looked, within: Array | float) -> NDArray[np.bool_]:

@@ -16,32 +16,49 @@ typedef struct { double h, mean[3], cov[6]; } Support;
 
 /* Vertices are stored in blocks of EIGHT: eight x, eight y, eight z. The last block is padded with copies.
  * Compilers do not vectorize loops over a block by themselves, as maxima and branches are in them: so a block's numbers
- * are vectors (an extension of gcc and clang, which split them where the processor's are shorter). */
+ * are vectors (an extension of gcc and clang) of the machine's width. Wider ones are split into single numbers where they
+ * are compared. */
 #define EIGHT 8
 #define BLOCK (3 * EIGHT)
-typedef double Vector __attribute__((vector_size(8 * EIGHT), aligned(8), may_alias));
-typedef int64_t Bits __attribute__((vector_size(8 * EIGHT), aligned(8), may_alias)); /* of a comparison: -1 or 0 each */
-#define LANES(p) (*(const Vector *)(p))
+#if defined(__AVX512F__)
+#define LANES 8
+#elif defined(__AVX__)
+#define LANES 4
+#else
+#define LANES 2
+#endif
+typedef double Vector __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
+typedef int64_t Bits __attribute__((vector_size(8 * LANES), aligned(8), may_alias)); /* of a comparison: -1 or 0 each */
+#define AT(p) (*(const Vector *)(p))
+/* x of vertex i, where a vector of vertices begins; its y and z are EIGHT and 2 EIGHT further */
+#define VERTEX(p, i) ((p) + (i) / EIGHT * BLOCK + (i) % EIGHT)
 
 static inline Vector larger(Vector a, Vector b) {
     const Bits first = a > b;
     return (Vector)(((Bits)a & first) | ((Bits)b & ~first));
 }
-static inline double sum(Vector v) { return ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7])); }
-static inline int any(Bits b) { return ((b[0] | b[4]) | (b[1] | b[5]) | (b[2] | b[6]) | (b[3] | b[7])) != 0; }
+static inline double sum(Vector v) {
+    double all = v[0];
+    for (int j = 1; j < LANES; ++j) all += v[j];
+    return all;
+}
+static inline int any(Bits b) {
+    int64_t all = b[0];
+    for (int j = 1; j < LANES; ++j) all |= b[j];
+    return all != 0;
+}
 
 /* Heights of n vertices in direction u, written to far; returns the largest. */
 static inline double support_heights(int64_t n, const double *restrict p, const double *u, double *restrict far) {
-    Vector most = LANES(p) * u[0] + LANES(p + EIGHT) * u[1] + LANES(p + 2 * EIGHT) * u[2];
-    *(Vector *)far = most;
-    for (int64_t i = EIGHT; i < n; i += EIGHT) {
-        p += BLOCK; far += EIGHT;
-        const Vector f = LANES(p) * u[0] + LANES(p + EIGHT) * u[1] + LANES(p + 2 * EIGHT) * u[2];
-        *(Vector *)far = f;
+    Vector most = (Vector){0} - INFINITY;
+    for (int64_t i = 0; i < n; i += LANES) {
+        const double *q = VERTEX(p, i);
+        const Vector f = AT(q) * u[0] + AT(q + EIGHT) * u[1] + AT(q + 2 * EIGHT) * u[2];
+        *(Vector *)(far + i) = f;
         most = larger(f, most);
     }
     double top = most[0];
-    for (int j = 1; j < EIGHT; ++j) top = most[j] > top ? most[j] : top;
+    for (int j = 1; j < LANES; ++j) top = most[j] > top ? most[j] : top;
     return top;
 }
 
@@ -65,12 +82,13 @@ static void support(int64_t n, const double *restrict p, const double *u, double
     const double most = support_heights(n, p, u, far), least = most - MAX_EXPONENT / sharp;
     const double ox = p[0], oy = p[EIGHT], oz = p[2 * EIGHT]; /* any vertex: moments about a distant point cancel */
     Vector s[10] = {{0}};
-    for (int64_t i = n; i % EIGHT; ++i) far[i] = -1e300; /* copies do not count */
-    for (int64_t i = 0; i < n; i += EIGHT, p += BLOCK, far += EIGHT) {
-        const Vector height = LANES(far);
+    for (int64_t i = n; i % LANES; ++i) far[i] = -1e300; /* copies do not count */
+    for (int64_t i = 0; i < n; i += LANES) {
+        const Vector height = AT(far + i);
         if (!any(height >= least)) continue;
+        const double *q = VERTEX(p, i);
         const Vector e = decay(sharp * (height - most));
-        const Vector x = LANES(p) - ox, y = LANES(p + EIGHT) - oy, z = LANES(p + 2 * EIGHT) - oz, ex = e * x, ey = e * y, ez = e * z;
+        const Vector x = AT(q) - ox, y = AT(q + EIGHT) - oy, z = AT(q + 2 * EIGHT) - oz, ex = e * x, ey = e * y, ez = e * z;
         s[0] += e; s[1] += ex; s[2] += ey; s[3] += ez;
         s[4] += ex * x; s[5] += ex * y; s[6] += ex * z;
         s[7] += ey * y; s[8] += ey * z; s[9] += ez * z;

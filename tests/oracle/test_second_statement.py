@@ -64,8 +64,10 @@ def test_it_shares_no_code_with_program_and_solver() -> None:
 
 
 def away_from_start(t: Transcription) -> np.ndarray:
+    """A point off the initial guess, but for variables that their bounds fix."""
     x, draw = first_iterate(t), np.random.default_rng(0)
-    return x + 1e-2 * draw.standard_normal(len(x)) * np.clip(np.abs(x), 1e-3, 1.0)
+    moved = x + 1e-2 * draw.standard_normal(len(x)) * np.clip(np.abs(x), 1e-3, 1.0)
+    return np.where(t.program.x_lower == t.program.x_upper, t.program.x_lower, moved)
 
 
 def second(t: Transcription, x: np.ndarray) -> tuple[Program, Variables]:
@@ -154,8 +156,10 @@ def test_of_a_board_whose_events_have_an_order(
     monkeypatch.setattr("impactopt.transcription.contact_guess.SPEED_STEPS", 0)
     board = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
     order = touches if isinstance(touches, int) else tuple(ENDS[letter] for letter in touches)
-    stiff = law(stiffness=1e6, damping=50.0)
-    check_rows(transcribed(dataclasses.replace(arm_problem(), target=board, law=stiff, touches=order)))
+    stiff, rough = law(stiffness=1e6, damping=50.0), ContactFriction(coefficient=0.6, stiffness=8e5)
+    problem = dataclasses.replace(arm_problem(), target=board, law=stiff, touches=order)
+    for friction in (None, rough):
+        check_rows(transcribed(dataclasses.replace(problem, friction=friction)))
 
 
 def test_of_a_slide_that_is_bounded() -> None:

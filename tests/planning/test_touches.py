@@ -11,6 +11,7 @@ import pytest
 
 from impactopt import (
     Board,
+    ContactFriction,
     FreeMass,
     GearLoad,
     ImpactProblem,
@@ -91,6 +92,20 @@ def test_mujoco_says_so_too(chopped: Solution) -> None:
     replay = chopped.validate(engine="mujoco")
     assert replay.impulse == pytest.approx(chopped.impulse, rel=1e-2)
     assert replay.peak_force == pytest.approx(chopped.plan.collision.force.max(), rel=0.02)
+
+
+def test_bristles_of_both_touches_are_those_of_replays() -> None:
+    """In a gap they are released: a touch begins with unbent ones, whatever bent them before."""
+    rough = ContactFriction(coefficient=0.6, stiffness=8e5)
+    solution = solve(stiff(friction=rough))
+    assert solution.status is Status.SOLVED and solution.problem.planned_touches == 2
+    assert "caution" not in solution.summary()
+    peak = solution.plan.collision.force.max()
+    for engine, near in (("pinocchio", 3e-3), ("mujoco", 1e-2)):
+        replay = solution.validate(engine=engine)
+        assert len(replay.touches) == 2
+        assert replay.impulse == pytest.approx(solution.impulse, rel=near)
+        assert replay.peak_force == pytest.approx(peak, rel=0.02)
 
 
 def test_force_is_zero_between_the_touches_and_only_there(chopped: Solution) -> None:

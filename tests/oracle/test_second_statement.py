@@ -36,7 +36,7 @@ from impactopt import (
     load_problem,
     space_arm,
 )
-from impactopt.planning.clearance_constraints import Margins, Watch
+from impactopt.planning.clearance_constraints import Margins, Watch, node_placements
 from impactopt.robots.tendons import Tendon
 from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.initial_guess import first_iterate
@@ -110,6 +110,21 @@ def test_of_bodies_that_are_kept_apart(biped_transcription: Transcription) -> No
     t = changed(biped_transcription)
     rows = Watch(t, Margins(dataclasses.replace(t.problem, terms=())), first_iterate(t)).constraints(0.15)
     assert len(rows) > 100
+    check_rows(t.with_clearance(rows))
+
+
+def test_of_bodies_that_are_kept_apart_from_a_target_that_friction_pushes_aside() -> None:
+    rough = ContactFriction(coefficient=0.6, moves_target=True)
+    t = transcribed(dataclasses.replace(arm_problem(), friction=rough))
+    x, margins = away_from_start(t), Margins(dataclasses.replace(t.problem, terms=()))
+    plan, spots = t.decode(x), node_placements(t, x)
+    rows = Watch(t, margins, x).constraints(0.5)
+    moved = {key.place: held.aside for key, held in rows.items() if np.any(held.aside)}
+    assert moved
+    for place, aside in moved.items():
+        since = spots.time[spots.names.index(place)] - plan.contact_end
+        velocity = plan.collision.tangential_velocity[-1]
+        np.testing.assert_allclose(aside - since * velocity, plan.aside(np.array([plan.contact_end]))[0])
     check_rows(t.with_clearance(rows))
 
 

@@ -277,6 +277,16 @@ class Motion:
     aside: Array = field(repr=False)
 
 
+def pushed_aside(time: Array, velocity: Array, since: Array) -> Array:
+    """Displacement (k, 3) [m] at times (k,) [s], from velocities (m, 3) [m/s] at times (m,) since contact.
+
+    After these the target keeps its last velocity.
+    """
+    moved = cumulative_trapezoid(velocity, time, axis=0, initial=0.0)
+    within = np.column_stack([np.interp(since, time, x) for x in moved.T])
+    return np.asarray(within + np.maximum(since - time[-1], 0.0)[:, None] * velocity[-1])
+
+
 @dataclass(frozen=True, kw_only=True)
 class PlannedCollision:
     """Predicted collision of a plan, at contact and at the m collocation points.
@@ -312,12 +322,8 @@ class PlannedCollision:
 
         After the contact the target keeps its last velocity.
         """
-        v, time = self.tangential_velocity, self.time
-        if v is None:
-            return np.zeros((len(since), 3))
-        moved = cumulative_trapezoid(v, time, axis=0, initial=0.0)
-        within = np.column_stack([np.interp(since, time, x) for x in moved.T])
-        return np.asarray(within + np.maximum(since - time[-1], 0.0)[:, None] * v[-1])
+        v = self.tangential_velocity
+        return np.zeros((len(since), 3)) if v is None else pushed_aside(self.time, v, since)
 
     @property
     def peak_force(self) -> float:

@@ -57,20 +57,22 @@ class Places:
     """Placements of the bodies at k instants.
 
     rotation (k, joints, 3, 3), translation (k, joints, 3) [m] : of the model's joints.
-    travel (k,) [m] : of the target along its normal.
+    travel (k,) [m] : of the target along its normal.  aside (k, 3) [m] : across it, by friction.
     phase (k,) : 0 before, 1 in, 2 after contact; 3: without a target.
     """
 
     rotation: Array
     translation: Array
     travel: Array
+    aside: Array
     phase: Index
 
     @classmethod
-    def of(cls, robot: Robot, q: Array, travel: Array, phase: Index) -> Places:
-        """Placements for configurations q (k, nq)."""
+    def of(cls, robot: Robot, q: Array, travel: Array, phase: Index, aside: Array | None = None) -> Places:
+        """Placements for configurations q (k, nq); aside None: the target stays on its normal."""
         rotation, translation = robot.forward_kinematics(q)
-        return cls(rotation=rotation, translation=translation, travel=travel, phase=phase)
+        aside = np.zeros((len(travel), 3)) if aside is None else aside
+        return cls(rotation=rotation, translation=translation, travel=travel, aside=aside, phase=phase)
 
     def __len__(self) -> int:
         return len(self.travel)
@@ -82,6 +84,7 @@ class Places:
             rotation=self.rotation[chosen],
             translation=self.translation[chosen],
             travel=self.travel[chosen],
+            aside=self.aside[chosen],
             phase=self.phase[chosen],
         )
 
@@ -166,8 +169,8 @@ class Bodies:
         present = np.zeros((k, len(self.world)), dtype=np.uint8)
         for w, body in enumerate(self.world):
             world[:, w, :9] = body.rotation.ravel()
-            # Only the target moves, along its normal.
-            world[:, w, 9:] = body.place + np.outer(at.travel, self.normal) * body.moves
+            # Only the target moves.
+            world[:, w, 9:] = body.place + (np.outer(at.travel, self.normal) + at.aside) * body.moves
             present[:, w] = self.present(body, at)
         return Placed(np.ascontiguousarray(joints), world, present)
 
@@ -240,7 +243,7 @@ class Bodies:
         if body >= 0:
             return at.rotation[k, body], at.translation[k, body]
         solid = self.world[-1 - body]
-        return solid.rotation, solid.place + at.travel[k] * self.normal * solid.moves
+        return solid.rotation, solid.place + (at.travel[k] * self.normal + at.aside[k]) * solid.moves
 
     def lower_bounds(self, at: Places, within: float) -> Iterator[tuple[float, int, Pair]]:
         """Smooth distances [m] below ``within``, with instant and pair, by increasing distance.

@@ -163,11 +163,11 @@ class Part:
     hinge: Hinge | None = None
     clear: bool = False
 
-    def placed(self, travel: float, normal: Array) -> Array:
-        """Its vertices (k, 3) [m] after a `travel` [m] of the target along the normal."""
+    def placed(self, travel: float, normal: Array, aside: Array | float = 0.0) -> Array:
+        """Its vertices (k, 3) [m] after a `travel` [m] of the target along the normal, and `aside` across."""
         vertices = self.solid.vertices
         if self.hinge is None:
-            return vertices + travel * normal if self.moves else vertices
+            return vertices + travel * normal + aside if self.moves else vertices
         turn = Rotation.from_rotvec(np.arctan2(travel, self.hinge.arm) * self.hinge.axis).as_matrix()
         return np.asarray((vertices - self.hinge.place) @ turn.T + self.hinge.place)
 

@@ -36,6 +36,7 @@ class ContactFriction(Described):
     Olsson, Astrom, Lischinsky, "A new model for control of systems with friction", IEEE TAC 40, 1995), within
     the cone also while the normal force falls, as the sliders of Cundall and Strack (Geotechnique 29, 1979).
     It never gives more energy than it took. The limit of a high stiffness is the friction without bristles.
+    Bodies that part release the bristles: each touch begins with unbent ones.
 
     The surface moves along the normal alone, as that of a target on a rail. With `moves_target` it moves
     across it too, as a point mass m, without rotation: m dv_s/dt is the friction on it, and v_t is relative

@@ -30,6 +30,7 @@ _HISTORIES = {
     **dict.fromkeys(("impulse", "saturated", "posture_error", "contact_start", "contact_end"), ""),
     "sole_ground": "k s 6",
     **dict.fromkeys(("contact_time", "contact_force"), "? m"),
+    "target_aside": "? k 3",
 }
 _SCHEMA: Mapping[str, Mapping[str, str]] = {
     "": {
@@ -43,7 +44,8 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
     | {"gear": "? k n"},
     "replayed": {**_MOTION, **_HISTORIES, "soles": "s"},
     "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"}
-    | dict.fromkeys(("velocity", "acceleration"), "? p n"),
+    | dict.fromkeys(("velocity", "acceleration"), "? p n")
+    | {"tangential_velocity": "? m 3"},
     "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "normal": "3", "contact": ""}
     | {"target": "? b c 3", "obstacles": "? o u 3", "ground": "? g"},
     "history": dict.fromkeys(("iteration", "objective", "max_violation", "kkt"), "i"),

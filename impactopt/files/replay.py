@@ -65,7 +65,7 @@ def program_of_record(record: Record, problem: ImpactProblem) -> Transcription |
     t = program_on(problem, nodes, elements, tuple(statement.get("shares", ())))
     clearances = {
         ClearanceKey(*(entry[key] for key in ClearanceKey._fields)): SeparatingDirection(
-            tuple(entry["vector"]), entry["least_distance"], entry["travel"]
+            tuple(entry["vector"]), *(entry[key] for key in SeparatingDirection._fields[1:] if key in entry)
         )
         for entry in statement["clearance"]
     }

@@ -159,6 +159,7 @@ class CollisionPage(LivePage):
                 mass=mass[0],
                 force=force,
                 travel=0.0,
+                aside=np.zeros(3),
                 zmp=zmp,
             )
         )

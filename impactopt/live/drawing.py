@@ -35,6 +35,7 @@ class Moment:
     mass: Array
     force: float
     travel: float
+    aside: Array
     zmp: Array
 
 
@@ -62,6 +63,7 @@ def moment_of(track: Track, time: float) -> Moment:
         mass=interpolated(track.mass),
         force=float(interpolated(track.force)),
         travel=float(interpolated(track.travel)),
+        aside=interpolated(track.aside),
         zmp=interpolated(track.zmp),
     )
 
@@ -157,7 +159,7 @@ class Drawing:
                 x, y, z, w = turn.as_quat()
                 handle.position, handle.wxyz = place - turn.apply(place), (w, x, y, z)
             elif part.moves:
-                handle.position = moment.travel * self.normal
+                handle.position = moment.travel * self.normal + moment.aside
         self.mass.position = moment.mass
         self.zmp.visible = bool(np.isfinite(moment.zmp).all())
         if self.zmp.visible:

@@ -138,10 +138,11 @@ def node_placements(t: ContactProgram, x: Array) -> NodePlacements:
     states = t.body_states(x)
     phase, time = np.array([s.phase for s in states], dtype=np.intp), np.array([s.time for s in states])
     # during contact the target counts as where it is at the first touch
-    travel = np.where(phase == IN_CONTACT, 0.0, t.travel(x, time))
+    travel, aside = t.displacement(x, time)
+    travel[phase == IN_CONTACT], aside[phase == IN_CONTACT] = 0.0, 0.0
     q = np.array([s.q for s in states])
     return NodePlacements(
-        names=tuple(s.name for s in states), time=time, at=Places.of(t.robot, q, travel, phase)
+        names=tuple(s.name for s in states), time=time, at=Places.of(t.robot, q, travel, phase, aside)
     )
 
 
@@ -161,7 +162,8 @@ class Watch:
         """x (n,) : initial guess; the target's travel and the nodes' phases stay as they are there."""
         self._t, self._margins, self._shapes = t, margins, margins.bodies.shapes
         placements = node_placements(t, x)
-        self._names, self._travel, self._phase = placements.names, placements.at.travel, placements.at.phase
+        self._names, self._phase = placements.names, placements.at.phase
+        self._travel, self._aside = placements.at.travel, placements.at.aside
         parts_of = {node.name: parts for node, parts in t.body_spots}
         lift = stack([part for name in self._names for part in parts_of[name]])
         # coordinates and legs of all nodes are self._lift @ x + self._const
@@ -197,7 +199,7 @@ class Watch:
             (joint, other), number = self._shapes.pairs[n].tolist(), int(self._shapes.number[n])
             direction, distance = self._directions[k, n].tolist(), float(self._margins.pieces[n])
             out[ClearanceKey(self._names[k], joint, other, number)] = SeparatingDirection(
-                tuple(direction), distance, float(self._travel[k])
+                tuple(direction), distance, float(self._travel[k]), tuple(self._aside[k].tolist())
             )
         # Each (instant, pair) occurs once in `near`, so that fancy assignment is safe.
         self._has[near.spot, near.pair] |= new
@@ -249,7 +251,8 @@ class Watch:
         c, ny = self._t.coordinates, self._t.builder.ny
         z = (self._lift @ x + self._const).reshape(len(self._names), -1)
         q = c.join(z[:, :ny], z[:, ny:])
-        return self._margins.bodies.placed(Places.of(self._t.robot, q, self._travel, self._phase))
+        at = Places.of(self._t.robot, q, self._travel, self._phase, self._aside)
+        return self._margins.bodies.placed(at)
 
     def _gaps_at(
         self, at: Placed, directions: Array, before: tuple[Placed, Looked] | None, within: float = TRIGGER
@@ -382,7 +385,8 @@ def clearance_violations(
     # The motion after a missed target exists only with an abort motion.
     for missed in (False, True) if plan.abort is not None else (False,):
         motion = plan.motion(SAMPLE_STEP, missed=missed)
-        at = Places.of(t.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
+        phase = np.where(missed, MISSED, motion.phase)
+        at = Places.of(t.robot, motion.q, motion.travel, phase, motion.aside)
         approaches += [
             (pair, _Approach(distance, float(motion.time[k]), missed))
             for k, pair, distance in _near(margins, at, share)

@@ -27,6 +27,7 @@ from impactopt.simulation.cases import errors_against
 from impactopt.simulation.engines import scene_of
 from impactopt.simulation.pinocchio_engine import Followed, follow_contact
 from impactopt.solvers.program import SolverResult, Status
+from impactopt.transcription.contact_guess import contact_order, fastest_at_contact, mass_at_contact
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.plan import Plan, PlannedStrike, Trajectory
 
@@ -179,9 +180,21 @@ def _contact_replay(
         partings=partings,
         planned_partings=problem.planned_touches - 1,
         guards=problem.target.guards,
-        may_plan=0 < partings < MOST_TOUCHES and not met_once(problem),
+        may_plan=0 < partings < MOST_TOUCHES and not met_once(problem) and _meet(problem, partings + 1),
         known=known,
     )
+
+
+def _meet(problem: ImpactProblem, touches: int) -> bool:
+    """True unless a plan of so many touches is refused, as point masses never meet so often.
+
+    A nail that stops in a gap and is driven again has no such order of events.
+    """
+    fastest = fastest_at_contact(problem)
+    if not np.isfinite(fastest):
+        return True
+    order = contact_order(problem.law, problem.target, mass_at_contact(problem), fastest, touches)
+    return order is not None
 
 
 def checked(result: SolverResult, replay: ContactReplay | None) -> SolverResult:

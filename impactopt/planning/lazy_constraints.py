@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Generic
 
 import numpy as np
-from numpy.typing import NDArray
 
 from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
@@ -73,19 +72,10 @@ def slide(problem: ImpactProblem, plan: Plan) -> float:
         return 0.0
     postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, CONTACT_SAMPLES)))
     points = np.array([striking_point(problem.robot, problem.striker, q) for q in postures])
-    points -= _target_displacement(plan.collision)
+    points -= plan.collision.aside(np.linspace(0.0, plan.collision.time[-1], CONTACT_SAMPLES))
     # From where contact begins, unlike `slides_beyond`, which is about the hit point.
     tangential = (points - points[0]) @ across(problem.normal).T
     return float(np.linalg.norm(tangential, axis=1).max())
-
-
-def _target_displacement(collision: PlannedCollision) -> NDArray[np.float64]:
-    """Displacement (`CONTACT_SAMPLES`, 3) [m] of the target across the normal during contact."""
-    v, time, at = collision.tangential_velocity, collision.time, np.linspace(0.0, 1.0, CONTACT_SAMPLES)
-    if v is None:
-        return np.zeros((CONTACT_SAMPLES, 3))
-    moved = np.vstack([np.zeros(3), np.cumsum(np.diff(time)[:, None] * (v[1:] + v[:-1]) / 2, axis=0)])
-    return np.column_stack([np.interp(at * time[-1], time, x) for x in moved.T])
 
 
 def slides_beyond(term: Slide, plan: Plan) -> str:

@@ -229,7 +229,8 @@ class Solution(Solved):
         least, nearest, touches = np.inf, "", list[dict[str, Any]]()
         for missed in (False, True) if self.plan.abort is not None else (False,):
             motion = self.plan.motion(missed=missed, reference=self._missed if missed else self.trajectory)
-            at = Places.of(problem.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
+            phase = np.where(missed, MISSED, motion.phase)
+            at = Places.of(problem.robot, motion.q, motion.travel, phase, motion.aside)
             found = bodies.survey(motion.time, at)
             if found.clearance < least:
                 least, nearest = found.clearance, " and ".join(found.nearest)

@@ -282,12 +282,6 @@ def check_touches(problem: Any) -> None:
     if (order or number > 1) and (why := met_once(problem)):
         raise InputError(f"touches is {touches}, but {why}: leave it out")
     law, target = problem.law, problem.target
-    bristles = problem.friction is not None and problem.friction.bristles
-    if bristles and any(phase.apart for phase in problem.contact_phases):
-        raise InputError(
-            "friction: bristles do not know when bodies part and meet again: leave their stiffness out, or "
-            "`touches`"
-        )
     if order and isinstance(law, ContactLaw) and not is_order(law, target, order):
         first = int(target.at_once)
         turn = [TURN] if law.switches else []
@@ -309,8 +303,6 @@ def met_once(problem: Any) -> str:
         return "two strikers meet it"
     if any(isinstance(objective, Penetration) for objective in problem.objectives):
         return "the objective Penetration is for one touch"
-    if problem.friction is not None and problem.friction.bristles:
-        return "the friction's bristles are for one touch"
     return ""
 
 

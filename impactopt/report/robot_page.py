@@ -105,6 +105,7 @@ def _still(robot: Robot, q: Array, label: str) -> Track:
         mass=mass,
         force=zero,
         travel=zero,
+        aside=np.zeros((1, 3)),
         zmp=unknown[:, :2],
         ground=unknown,
         contact_start=np.nan,

@@ -116,7 +116,7 @@ def pack_solid(name: str, solid: Solid, arrays: Arrays) -> dict[str, Any]:
 
 def pack_track(name: str, track: Track, arrays: Arrays) -> dict[str, Any]:
     """Name and contact of a motion for the header; its histories are added to `arrays`."""
-    given = ("time", "places", "hand", "mass", "force", "travel", "zmp", "ground")
+    given = ("time", "places", "hand", "mass", "force", "travel", "aside", "zmp", "ground")
     arrays |= {f"{name}_{part}": getattr(track, part) for part in given}
     return {
         "name": name,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -15,7 +15,7 @@ from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation.result import centre_of_pressure, travelled
-from impactopt.transcription.plan import Trajectory
+from impactopt.transcription.plan import Trajectory, pushed_aside
 
 Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
@@ -42,7 +42,7 @@ class Track:
         the universe first
     hand, mass (k, 3) [m] : striking point, centre of mass
     force (k,) [N] : on the target along its normal
-    travel (k,) [m] : of the target along its normal, at most FAR
+    travel (k,), aside (k, 3) [m] : of the target along its normal, at most FAR, and across it by friction
     zmp (k, 2) [m], ground (k, 3) [N] : ZMP, and force of the ground on the robot; nan if unknown
     contact_start, contact_end [s] : nan without contact
     missing : whether there is no target
@@ -55,6 +55,7 @@ class Track:
     mass: Array
     force: Array
     travel: Array
+    aside: Array
     zmp: Array
     ground: Array
     contact_start: float
@@ -109,7 +110,7 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
     travel = travelled(time, speed, start)
     if prefix == "reference" and record.summary.get("target", {}).get("broken", 1.0) < 0.5:
         travel[time > end] = 0.0  # an unbroken board springs back
-    travel = travel[chosen]
+    travel, aside = travel[chosen], _aside(a, prefix, shown, start)
     places, hand, mass = places_of(robot, robot.striker(problem.striker).model_frame, q)
     legged = len(a["polygon"]) > 0
     return Track(
@@ -120,12 +121,26 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
         mass=mass,
         force=force,
         travel=np.clip(travel, -FAR, FAR),
+        aside=aside,
         zmp=centre_of_pressure(wrench) if legged else np.full((len(shown), 2), np.nan),
         ground=wrench[:, :3] if legged else np.full((len(shown), 3), np.nan),
         contact_start=start,
         contact_end=end,
         missing=prefix == MISSED,
     )
+
+
+def _aside(a: Mapping[str, Array], prefix: str, shown: Array, start: float) -> Array:
+    """Displacement (k, 3) [m] of the target across its normal at the shown instants (k,) [s].
+
+    Zero, if friction does not move the target, or the record does not have it.
+    """
+    velocity, found = a.get("collision_tangential_velocity"), a.get(f"{prefix}_target_aside")
+    if prefix == "reference" and velocity is not None:
+        return pushed_aside(a["collision_time"], velocity, shown - start)
+    if found is not None and len(found):
+        return np.column_stack([np.interp(shown, a[f"{prefix}_time"], x) for x in np.transpose(found)])
+    return np.zeros((len(shown), 3))
 
 
 def places_of(robot: Robot, frame: str, postures: Array) -> tuple[Array, Array, Array]:

@@ -438,7 +438,7 @@ def simulate_mujoco(
             if has_passive:  # springs act at every step: no computer samples them
                 torque = np.where(passive, servo.springs(data.qpos[replay.qpos_index], rates), torque)
             speeds = replay.hand_speeds()
-            target_before = replay.target
+            target_before, aside = replay.target, replay.tangential[0]
             push = replay.push(speeds, step)
             forces = push.forces
             replay.apply(torque, push.forces)
@@ -460,7 +460,7 @@ def simulate_mujoco(
                 assert state is not None
                 contact_values = float(push.total[0]), replay.contact.speed(target_before), float(speeds[0])
                 loads = demand, torque, ground, corners, gears.take()
-                recorded.append((t, *state, *contact_values, *loads, stance_at(now, t)))
+                recorded.append((t, *state, *contact_values, aside, *loads, stance_at(now, t)))
                 check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(t)
                 if fall:

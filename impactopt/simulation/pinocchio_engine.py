@@ -384,6 +384,7 @@ def simulate_pinocchio(
                 (
                     t,
                     *motion,
+                    state.tangential[0],
                     first.demand,
                     first.torque,
                     world.ground(),

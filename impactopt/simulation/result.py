@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from impactopt.contact.friction import ContactFriction
+from impactopt.contact.friction import ContactFriction, moves_target
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
@@ -124,6 +124,7 @@ class Simulation:
     q (k, nq), v (k, nv) : Pinocchio's
     force (k,) [N] : contact force of all strikers, at the instant
     target_speed, hand_speed (k,) : [m/s] along the normal
+    target_aside (k, 3) [m] : displacement of the target across the normal; (0, 3): friction does not move it
     demand, torque (k, n) [N m] : of the servo before saturation, and of the motors
     gear (k, n) [N m] : torque of largest magnitude through each gear since the instant before
     sole_ground (k, soles, 6) : [N, N m] wrench of the ground on each sole about the world's origin; it may
@@ -212,6 +213,7 @@ class Simulation:
     stands: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool), repr=False)
     polygons: tuple[Array, ...] = field(default=(), repr=False)
     landing_speed: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    target_aside: Array = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
 
     @property
     def ground(self) -> Array:
@@ -583,9 +585,9 @@ def simulation_of(
 ) -> Simulation:
     """Simulation from recorded instants.
 
-    recorded : of each instant: time, q, v, force, target speed, hand speed, demand, torque, wrenches of soles
-        and of supporting hands, positions of the soles' corners, torque through the gears since the instant
-        before, number of the stance phase.
+    recorded : of each instant: time, q, v, force, target speed, hand speed, target's displacement across the
+        normal, demand, torque, wrenches of soles and of supporting hands, positions of the soles' corners,
+        torque through the gears since the instant before, number of the stance phase.
     rest : the other fields of the simulation.
 
     Raises
@@ -595,7 +597,8 @@ def simulation_of(
     if not recorded:
         raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")
     columns = [np.array(c) for c in zip(*recorded, strict=True)]  # one array for each quantity
-    time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, corners, gear, stance = columns
+    time, q, v, force, target_speed, hand_speed, aside, *more = columns
+    demand, torque, sole_ground, corners, gear, stance = more
     stance = stance if scene.standing.size else stance[:0]
     slip, lift = slip_and_lift(scene, corners, stance)
     landings = landing_speeds(scene, time, corners, sole_ground, stance) if stance.size else np.zeros(0)
@@ -610,6 +613,7 @@ def simulation_of(
         force=force,
         target_speed=target_speed,
         hand_speed=hand_speed,
+        target_aside=aside if moves_target(scene.friction) else aside[:0],
         demand=demand,
         torque=torque,
         sole_ground=sole_ground,

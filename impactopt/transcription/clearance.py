@@ -18,6 +18,7 @@ import pinocchio as pin
 import scipy.sparse as sp
 
 from impactopt.bodies.separation import Separations
+from impactopt.bodies.world import WorldBody
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
@@ -252,12 +253,18 @@ class SeparatingDirection(NamedTuple):
     vector (3) : unit vector from the other body to the link, in the other's frame. The maximization of the
         separation starts there.
     least_distance : [m].
-    travel : of the target [m], if the other body moves with it.
+    travel [m], aside (3) [m] : of the target along its normal and across it, if the other body moves with it.
     """
 
     vector: tuple[float, ...]
     least_distance: float
     travel: float = 0.0
+    aside: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def placed(self, body: WorldBody, normal: Array) -> pin.SE3:
+        """Placement of the other body, for the target's normal (3,)."""
+        shift = self.travel * normal + np.array(self.aside)
+        return pin.SE3(body.rotation, body.place + shift * body.moves)
 
 
 def add_clearance_constraints(
@@ -290,8 +297,7 @@ def add_clearance_constraints(
         chain, pattern, name = known[pair]
         before = None
         if body is not None:
-            shift = direction.travel * bodies.normal * body.moves
-            before = pin.SE3(body.rotation, body.place + shift).inverse()  # distances are in the body's frame
+            before = direction.placed(body, bodies.normal).inverse()  # distances are in the body's frame
         n = shapes.index[key.joint, key.other, key.number]
         group = groups.setdefault(len(chain.columns), _Group())
         group.keys.append(key)
@@ -365,7 +371,7 @@ def move_bodies(
         name = f"apart{len(chain.columns)}"
         if key.other < 0:
             body, normal = problem.bodies.world[-1 - key.other], problem.bodies.normal
-            at = pin.SE3(body.rotation, body.place + direction.travel * normal * body.moves)
+            at = direction.placed(body, normal)
             parameters[name][instance[name], :12] = _placement(at.inverse() * chain.placements[0])
         instance[name] += 1
     for name, block in of_name.items():

@@ -194,6 +194,7 @@ class Collision(ContactParameters):
     suffix : appended to the names of places.
     legs, w : joint angles of the constrained legs and sole wrenches, at the stages.
     torques : torques over limit at the stages, as variables if a term is about drives; else empty.
+    apart (stages,) : mask of the stages in a gap between touches.
     forceless (stages,) : mask of the stages at which the contact force is zero.
     holds : the force may pull while a nail is driven.
     coast_legs, coast_rates : joint angles and rates of the legs of the coasting reference.
@@ -222,9 +223,10 @@ class Collision(ContactParameters):
         p, c, limits = b.problem, b.coordinates, b.limits
         self.phases = p.contact_phases
         self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in range(len(self.phases))]
-        self.forceless = np.array([self.phases[s.phase].apart for s in stages])
+        self.apart = np.array([self.phases[s.phase].apart for s in stages])
         # A touch ends where the law's `separation` is zero. That is a constraint of its last stage, so the
         # force there is zero by its bounds, and the law is no constraint.
+        self.forceless = self.apart.copy()
         self.forceless[[i for i, f in zip(self.end, self.phases, strict=True) if f.end == SEPARATION]] = True
         self._prefix = prefix = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
@@ -258,7 +260,9 @@ class Collision(ContactParameters):
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
         self.xt = add("target travel", 1, labels=["target"])
         bent = 3 * len(p.strikers) if len(friction_parameters(p)) > 2 else 0
-        self.bristles = add("bristle deflection", bent, scale=DEPTH_SCALE)
+        # in a gap the bristles are not bent, by their bounds, so that each touch begins with unbent ones
+        most = np.where(self.apart, 0.0, np.inf)[:, None]
+        self.bristles = add("bristle deflection", bent, scale=DEPTH_SCALE, lower=-most, upper=most)
         self.tangential = add("target tangential velocity", 3 * moves_target(p.friction))
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
@@ -366,6 +370,12 @@ class Collision(ContactParameters):
         """Variables at each stage that have no known value at contact."""
         return [self.coast_legs, self.coast_rates, self.legs, self.f, self.w]
 
+    def zeros(self) -> Index:
+        """Indices (k,) of variables that are zero by their bounds, so that no constraint determines them."""
+        masks = (self.f, self.forceless), (self.bristles, self.apart)
+        each = [group.index(int(i)) for group, mask in masks for i in np.flatnonzero(mask)]
+        return np.concatenate([np.zeros(0, dtype=np.intp), *each])
+
     def _gains(self) -> tuple[Array, Array]:
         """Servo gains Kp and Kd (n,)."""
         return self._b.robot.kp, self._b.robot.kd
@@ -397,11 +407,11 @@ class Collision(ContactParameters):
         integrals, states = zip(*self.integrated(), strict=True)
         groups = (*states, self.w, self.f, *self.states())
         step = 0
+        zeros = self.zeros()
         for members in sorted({s.members for s in self.stages}):
-            # a force that is zero by its bounds is not determined
-            part = [g.index(i) for i in members for g in groups if g is not self.f or not self.forceless[i]]
+            part = np.concatenate([g.index(i) for i in members for g in groups])
             out += [determined(Turn.ELEMENT, one.index(i), step) for i in members for one in integrals]
-            out.append(determined(Turn.ELEMENT, np.concatenate(part), step + 1))
+            out.append(determined(Turn.ELEMENT, part[~np.isin(part, zeros)], step + 1))
             step += 2
         if self.joined.count:
             joined = [group for _, group in self._integrals()]
@@ -604,7 +614,7 @@ class Collision(ContactParameters):
         base, joint = first["collision"] + part["base"], first["collision"] + part["joints"]
         b.equal("collision dynamics", place, DIRECTIONS[: c.base], base, b.limits.unbalanced)
         b.equal("collision dynamics", place, joints, joint, percent("of the joint's limit off"))
-        if self.bristles.size:
+        if self.bristles.size and not self.apart[i]:
             bristles = [f"bristle {k}" for k in range(self.bristles.size)]
             outputs = first["collision"] + part["bristles"]
             b.equal("bristles", place, bristles, outputs, Measure("mm", 1e3 * DEPTH_SCALE, "off"))

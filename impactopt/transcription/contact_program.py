@@ -331,8 +331,10 @@ class ContactProgram(ABC):
         """Configurations at the nodes of `body_spots`, for solver variables (n,)."""
 
     @abstractmethod
-    def travel(self, x: Array, time: Array) -> Array:
-        """Travel (k,) [m] of the target at these times [s] since the start."""
+    def displacement(self, x: Array, time: Array) -> tuple[Array, Array]:
+        """Displacement (k,) of the target along its normal, and (k, 3) across it [m], at these times (k,) [s]
+        since the start.
+        """
 
     @abstractmethod
     def decode(self, x: Array) -> Any:

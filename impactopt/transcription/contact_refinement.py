@@ -174,12 +174,9 @@ class _FinerContact:
             fixed.append(new_group.index(0))
         for new, old in zip(self.hit.lasting, self._planned.lasting, strict=True):
             map_contact(new, old, z, x)
-            # positions after contact follow from the solution, and a force that is zero by its bounds is not
-            # determined
+            # positions after contact follow from the solution
             fixed += [new.after.index(0)] if new.after.count else []
-            fixed += [
-                new.f.index(int(i)) for i in np.flatnonzero(new.forceless[: None if self._apart else -1])
-            ]
+            fixed.append(np.setdiff1d(new.zeros(), [] if self._apart else new.f.index(-1)))
         ends = {phase.end for phase in self._builder.problem.contact_phases}
         # Inequalities do not matter here: the contact runs as it does, and `contact_error` looks at the
         # result.
@@ -325,6 +322,8 @@ def map_contact(new: Collision, old: Collision, into: Array, x: Array) -> None:
         integral.write(into, d)
     for new_group, old_group in zip(new.kept_groups(), old.kept_groups(), strict=True):
         new_group.write(into, old_group.read(x))
+    # bristles jump where they are released: there is no polynomial from a touch into a gap
+    into[new.zeros()] = 0.0
 
 
 def same_places(new: Sequence[CollocationPoint], old: Sequence[CollocationPoint]) -> list[tuple[int, int]]:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates, base_rates, solved
@@ -266,13 +267,24 @@ class Motion:
     """Motion of the bodies at k instants.
 
     time (k,) [s].  phase (k,) : 0 before, 1 during, 2 after contact.  q (k, nq) : Pinocchio's configurations.
-    travel (k,) : displacement of the target along its normal [m].
+    travel (k,), aside (k, 3) : displacement of the target along its normal and across it [m].
     """
 
     time: Array = field(repr=False)
     phase: NDArray[np.intp] = field(repr=False)
     q: Array = field(repr=False)
     travel: Array = field(repr=False)
+    aside: Array = field(repr=False)
+
+
+def pushed_aside(time: Array, velocity: Array, since: Array) -> Array:
+    """Displacement (k, 3) [m] at times (k,) [s], from velocities (m, 3) [m/s] at times (m,) since contact.
+
+    After these the target keeps its last velocity.
+    """
+    moved = cumulative_trapezoid(velocity, time, axis=0, initial=0.0)
+    within = np.column_stack([np.interp(since, time, x) for x in moved.T])
+    return np.asarray(within + np.maximum(since - time[-1], 0.0)[:, None] * velocity[-1])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,6 +316,14 @@ class PlannedCollision:
     acceleration: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     forces: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     tangential_velocity: Array | None = field(default=None, repr=False)
+
+    def aside(self, since: Array) -> Array:
+        """Displacement (k, 3) [m] of the target across the normal at times (k,) [s] since contact.
+
+        After the contact the target keeps its last velocity.
+        """
+        v = self.tangential_velocity
+        return np.zeros((len(since), 3)) if v is None else pushed_aside(self.time, v, since)
 
     @property
     def peak_force(self) -> float:
@@ -637,6 +657,7 @@ class Plan:
             phase=np.repeat([0, 1, 2], [len(before), len(within), len(after)]),
             q=np.concatenate([q_before, during, q_after]),
             travel=np.zeros(len(time)) if missed else self.travel(time),
+            aside=np.zeros((len(time), 3)) if missed else self.aside(time),
         )
 
     def through_contact(self, s: Array, *, missed: bool = False) -> Array:
@@ -666,6 +687,10 @@ class Plan:
         before = float(self.problem.target.speed_before()) * np.minimum(since, 0.0)
         within = np.interp(since, hit.time, displacement, left=0.0)
         return before + within + last * np.maximum(since - hit.time[-1], 0.0)
+
+    def aside(self, time: Array) -> Array:
+        """Displacement (k, 3) [m] of the target across the normal at times (k,) [s], as of `travel`."""
+        return self.collision.aside(np.asarray(time) - self.contact_start)
 
     def stances(self) -> list[dict[str, Any]]:
         """Stance phases as in ``summary.json``; none if the problem has one stance.

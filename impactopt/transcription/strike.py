@@ -141,11 +141,12 @@ class StrikeTranscription(ContactProgram):
             for (place, slots), phase, time in zip(places, (0, 2), (0.0, end), strict=True)
         ]
 
-    def travel(self, x: Array, time: Array) -> Array:
+    def displacement(self, x: Array, time: Array) -> tuple[Array, Array]:
         hit = self.decode(x).collision
         # by the trapezoidal rule; the two states are at contact and at separation
         displacement = float(np.diff(hit.time) @ (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)
-        return np.where(np.asarray(time) > 0, displacement, 0.0)
+        after = np.asarray(time) > 0
+        return np.where(after, displacement, 0.0), hit.aside(np.where(after, hit.time[-1], 0.0))
 
     # ------------------------------------------------------------------ solution
     def decode(self, x: Array) -> PlannedStrike:

@@ -442,8 +442,9 @@ class Transcription(ContactProgram):
         stands = [spot for sequence in (self.before, *self.after) for spot in sequence.spots()]
         return [*self.swing_spots(), *self.follow_spots(), *stands]
 
-    def travel(self, x: Array, time: Array) -> Array:
-        return self.decode(x).travel(time)
+    def displacement(self, x: Array, time: Array) -> tuple[Array, Array]:
+        plan = self.decode(x)
+        return plan.travel(time), plan.aside(time)
 
     def decode(self, x: Array) -> Plan:
         """The plan of solver variables x (n,)."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -131,8 +132,10 @@ def run(say: Say, *, folder: Path = DEMO.parent, controller: str = "servo") -> R
     return Report(name="truth", numbers={"rows": rows, "controller": controller}, tables=tables)
 
 
-# problems that are planned with friction of the striking point, too
+# problems that are planned with friction of the striking point, too: without bristles, and with such of this
+# part of the normal stiffness
 RUBBING, ROUGH = ("punch.toml", "door.toml", "punch_g1.toml", "chop.toml"), ContactFriction(coefficient=0.6)
+BRISTLES = 0.8
 
 
 def problems(folder: Path, say: Say) -> Iterator[tuple[str, Callable[[], Solution]]]:
@@ -140,15 +143,21 @@ def problems(folder: Path, say: Say) -> Iterator[tuple[str, Callable[[], Solutio
     files = sorted(folder.glob("*.toml"))
     for file in files:
         yield file.name, lambda file=file: solved(file, say)  # type: ignore[misc]
-    for file in (file for file in files if file.name in RUBBING):
+    for file, part in product((file for file in files if file.name in RUBBING), (0.0, BRISTLES)):
 
-        def rubbing(file: Path = file) -> Solution:
-            return solved(file, say, lambda problem: replace(problem, friction=ROUGH))
+        def rubbing(file: Path = file, part: float = part) -> Solution:
+            return solved(file, say, lambda problem: _rough(problem, part))
 
-        yield f"{file.stem}, friction {ROUGH.coefficient:g}", rubbing
+        yield f"{file.stem}, friction {ROUGH.coefficient:g}{', bristles' if part else ''}", rubbing
     for name, changes in VARIANTS.items():
         if name != "demo" or folder / DEMO.name not in files:
             yield name, lambda name=name, changes=changes: _variant(name, changes, say)  # type: ignore[misc]
+
+
+def _rough(problem: ImpactProblem, part: float) -> ImpactProblem:
+    """With friction, and bristles of this part of the normal stiffness; 0: none."""
+    stiffness = part * problem.law.parameters["stiffness"]
+    return replace(problem, friction=replace(ROUGH, stiffness=stiffness))
 
 
 def _variant(name: str, changes: dict[str, Any], say: Say) -> Solution:

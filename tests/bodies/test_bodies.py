@@ -307,6 +307,10 @@ def test_the_target_comes_goes_and_moves() -> None:
     (_, before), (_, after) = (free.placement(places, k, -1 - w) for k in (0, 2))
     np.testing.assert_allclose(after - before, 0.2 * free.normal, atol=1e-12)
     assert free.present(free.world[w], places).tolist() == [True, True, True, False]
+    across = np.outer([0.0, 0.0, 1.0, 0.0], [0.0, 0.1, -0.3])
+    pushed = Places.of(problem.robot, q, places.travel, places.phase, across)
+    np.testing.assert_allclose(free.placement(pushed, 2, -1 - w)[1] - after, across[2], atol=1e-12)
+    np.testing.assert_allclose(free.placed(pushed).world[2, w, 9:] - after, across[2], atol=1e-12)
 
 
 # ---- the world

@@ -22,7 +22,6 @@ from impactopt import (
     FullDynamics,
     KelvinVoigt,
     MujocoDynamics,
-    Nail,
     RigidWall,
     SpringDamper,
     VirtualMass,
@@ -238,9 +237,6 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match=r"friction_stiffness: has 0; all must be > 0"):
         model.collide(*at, friction_stiffness=0.0)
     rigid = dataclasses.replace(model, contact_friction=ContactFriction(coefficient=0.6))
-    nail = {"target": Nail(mass=0.2, resistance=500.0), "law": KelvinVoigt(stiffness=1e5, damping=50.0)}
-    with pytest.raises(InputError, match=r"touches is 2, but the friction's bristles are for one touch"):
-        dataclasses.replace(arm_problem(), friction=BENDING, touches=2, **nail)
     with pytest.raises(InputError, match=r"the model 'sdc' of the collision has none"):
         dataclasses.replace(arm_problem(), friction=BENDING, collision="sdc")
     with pytest.raises(InputError, match=r"no setting 'friction_stiffness'"):

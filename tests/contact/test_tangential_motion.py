@@ -282,6 +282,9 @@ def test_a_plan_is_what_both_engines_replay(friction: ContactFriction) -> None:
         assert done.outcome["tangential_speed_m_s"] == pytest.approx(
             outcome["tangential_speed_m_s"], rel=5e-3
         )
+        aside = plan.aside(done.time[-1:])[0]
+        assert np.linalg.norm(aside) > 1e-3
+        np.testing.assert_allclose(done.target_aside[-1], aside, atol=0.02 * np.linalg.norm(aside))
     light = dataclasses.replace(problem, target=FreeMass(mass=0.5 * problem.target.parameters["mass"]))
     done, planned = (
         simulate_pinocchio(problem.robot, way, scene_of(light), until=until, step=1e-4),
@@ -293,7 +296,7 @@ def test_a_plan_is_what_both_engines_replay(friction: ContactFriction) -> None:
     assert slide(problem, plan) < slide(problem, dataclasses.replace(plan, collision=fixed))
     held = dataclasses.replace(problem, friction=dataclasses.replace(friction, moves_target=False))
     done = simulate_pinocchio(problem.robot, way, scene_of(held), until=until)
-    assert "tangential_speed_m_s" not in done.outcome
+    assert "tangential_speed_m_s" not in done.outcome and not done.target_aside.size
 
 
 def test_plans_follow_the_targets_mass() -> None:

@@ -132,7 +132,8 @@ def _piece(
         body = bodies.world[-1 - other]
         second.append(len(joints) + len(turns))
         turns.append(np.asarray(body.rotation))
-        shifts.append(body.place + float(row["travel"]) * bodies.normal * body.moves)
+        shift = float(row["travel"]) * bodies.normal + np.array(row.get("aside", np.zeros(3)))
+        shifts.append(body.place + shift * body.moves)
 
     def value(v: Variables) -> Array:
         pin.forwardKinematics(robot.model, robot.data, posture(v))

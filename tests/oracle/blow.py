@@ -169,6 +169,9 @@ class Blow:
             f"{self.prefix}collision legs": self.limits.legs,
         }
         times = zip(self.durations, self.shortest, strict=True)
+        if p.friction is not None and p.friction.stiffness > 0:  # nothing bends bristles in a gap
+            bent = np.where([self.spells[s.phase].apart for s in self.stages], 0.0, np.inf)[:, None]
+            out[f"{self.prefix}bristle deflection"] = (-bent, bent)
         out |= dict.fromkeys(torques, (-most_torque, most_torque))
         return out | {name: (np.array([least]), np.array([longest])) for name, least in times}
 
@@ -256,6 +259,7 @@ class Blow:
         driven = np.concatenate([np.ones(robot.base), np.where(r.sprung, 0.0, 1.0)[robot.independent]])
         lifted = self.torque(i) if self.torque(i) in self.lifted else None
         bristles = robot.friction is not None and robot.friction.stiffness > 0
+        bends = bristles and not self.spells[self.stages[i].phase].apart
         carried = robot.friction is not None and robot.friction.moves_target
 
         def value(v: Variables) -> Array:
@@ -275,7 +279,7 @@ class Blow:
             bounded = servo if lifted is None else servo - v.get(lifted)
             out = np.concatenate([*found, tau[robot.base :] / r.torque_limit - servo, bounded, inside(w)])
             T = v.one(self.durations[self.stages[i].phase])
-            if bristles:
+            if bends:
                 slope = self.slope(v, "bristle deflection", i, np.zeros(bent.size))
                 out = np.concatenate([out, (slope - T * robot.bending(q, qd, f, bent, side)) / DEPTH])
             if carried:
@@ -295,7 +299,7 @@ class Blow:
             ("collision dynamics", place, [*DIRECTIONS[: robot.base], *r.joint_names], 0.0, 0.0),
             (f"{limits.torque.name} in collision", place, r.joint_names, -most, most),
         ]
-        if bristles:
+        if bends:
             each = [f"bristle {k}" for k in range(3 * len(robot.hands))]
             cone = [*cone, ("bristles", place, each, 0.0, 0.0)]
         if carried:

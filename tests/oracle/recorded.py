@@ -303,25 +303,24 @@ def _bodies(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
     time = np.asarray(arrays["reference_time"])
     parts = [(time[k], q[k], np.full(int(k.sum()), n), n) for n in (0, 2) if (k := phase == n).any()]
     bodies = p.problem.bodies
-    gone = 0.0
+    gone, across, drift = 0.0, np.zeros(3), np.zeros(3)
     if p.blows:
         blow, y0 = p.blows[0], p.at_contact(v)
         stages = [blow.moved(v, i, y0) for i in range(len(blow.stages))]
         legs = [blow.get(v, "collision legs", i) for i in range(len(stages))]
         postures = np.array([p.robot.posture(s[0], leg) for s, leg in zip(stages, legs, strict=True)])
         times = np.array([s[1] for s in stages]) + _start(p, v)
-        survey = bodies.survey(
-            times,
-            Places.of(
-                p.problem.robot,
-                postures,
-                np.array([s[3] for s in stages]),
-                np.ones(len(stages), dtype=np.intp),
-            ),
-        )
+        asides = np.zeros((len(stages), 3))
+        if p.problem.friction is not None and p.problem.friction.moves_target:
+            rates = np.array([blow.get(v, "target tangential velocity", i) for i in range(len(stages))])
+            before, steps = np.vstack([np.zeros(3), rates[:-1]]), np.diff([0.0, *(s[1] for s in stages)])
+            asides, drift = np.cumsum(steps[:, None] * (before + rates) / 2, axis=0), rates[-1]
+        gone, across = stages[-1][3], asides[-1]
+        travels, phases = np.array([s[3] for s in stages]), np.ones(len(stages), dtype=np.intp)
+        survey = bodies.survey(times, Places.of(p.problem.robot, postures, travels, phases, asides))
         yield Off("distance of bodies", max(-survey.clearance, 0.0), " and ".join(survey.nearest))
         state = blow.get(v, "target state", blow.end[-1])
-        gone, speed = stages[-1][3], float(p.problem.target.velocity(state, blow.target))
+        speed = float(p.problem.target.velocity(state, blow.target))
         if p.problem.target.stays:
             speed = 0.0
     else:
@@ -333,10 +332,11 @@ def _bodies(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
             (np.asarray(arrays["missed_time"])[after], postures, np.full(len(postures), MISSED), MISSED)
         )
     for times, postures, phases, n in parts:
-        travel = np.zeros(len(times))
+        travel, aside = np.zeros(len(times)), np.zeros((len(times), 3))
         if n == 2:
-            travel = gone + speed * (times - float(arrays["reference_contact_end"]))
-        at = Places.of(p.problem.robot, postures, travel, phases)
+            since = times - float(arrays["reference_contact_end"])
+            travel, aside = gone + speed * since, across + np.outer(since, drift)
+        at = Places.of(p.problem.robot, postures, travel, phases, aside)
         survey = bodies.survey(times, at)
         where = f"{' and '.join(survey.nearest)} at {survey.time:.4g} s"
         yield Off("distance of bodies", max(-survey.clearance, 0.0), where)

@@ -229,7 +229,8 @@ class RobotMotion:
             jac, slide, full = self._slide(q, v, hand, side)
             push = self.normal * force
             if self.friction is not None and self.friction.stiffness:
-                push = push + (self.leaning(force, bent[k])[0] if len(bent) else 0.0)
+                limit = self.friction.coefficient * force
+                push = push + (limit * self.leaning(force, bent[k]) if len(bent) else 0.0)
             elif self.friction is not None:
                 push = push + self.friction.coefficient * force * slide / full
             out.append((jac, push))
@@ -245,11 +246,11 @@ class RobotMotion:
         slip = 0.0 if self.friction is None else self.friction.slip_speed
         return jac, slide, float(np.hypot(np.linalg.norm(slide), slip))
 
-    def leaning(self, force: float, bent: Array) -> tuple[Array, float]:
-        """Force (3,) [N] of bristles under a normal force, and the limit [N] that it cannot exceed."""
+    def leaning(self, force: float, bent: Array) -> Array:
+        """Force (3,) of bristles under a normal force [N] over the limit that it cannot exceed."""
         limit, stiffness = self.friction.coefficient * force, self.friction.stiffness
         elastic = stiffness * float(np.hypot(np.linalg.norm(bent), 1e-9))  # bent by a nanometre at least
-        return limit * stiffness * bent / max(limit, elastic), limit
+        return stiffness * bent / max(limit, elastic)
 
     def bending(
         self, q: Array, v: Array, forces: Iterable[float], bent: Sequence[Array], side: Array
@@ -257,8 +258,8 @@ class RobotMotion:
         """Rates (3 hands,) [m/s] of the deflections of the hands' bristles."""
         rates = []
         for hand, force, each in zip(self.hands, forces, bent, strict=False):
-            (pull, limit), (_, slide, full) = self.leaning(force, each), self._slide(q, v, hand, side)
-            rates.append(slide - full * pull / limit)
+            _, slide, full = self._slide(q, v, hand, side)
+            rates.append(slide - full * self.leaning(force, each))
         return np.concatenate(rates)
 
     def resting(self) -> Array:

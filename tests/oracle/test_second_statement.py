@@ -36,7 +36,7 @@ from impactopt import (
     load_problem,
     space_arm,
 )
-from impactopt.planning.clearance_constraints import Margins, Watch
+from impactopt.planning.clearance_constraints import Margins, Watch, node_placements
 from impactopt.robots.tendons import Tendon
 from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.initial_guess import first_iterate
@@ -64,8 +64,10 @@ def test_it_shares_no_code_with_program_and_solver() -> None:
 
 
 def away_from_start(t: Transcription) -> np.ndarray:
+    """A point off the initial guess, but for variables that their bounds fix."""
     x, draw = first_iterate(t), np.random.default_rng(0)
-    return x + 1e-2 * draw.standard_normal(len(x)) * np.clip(np.abs(x), 1e-3, 1.0)
+    moved = x + 1e-2 * draw.standard_normal(len(x)) * np.clip(np.abs(x), 1e-3, 1.0)
+    return np.where(t.program.x_lower == t.program.x_upper, t.program.x_lower, moved)
 
 
 def second(t: Transcription, x: np.ndarray) -> tuple[Program, Variables]:
@@ -108,6 +110,21 @@ def test_of_bodies_that_are_kept_apart(biped_transcription: Transcription) -> No
     t = changed(biped_transcription)
     rows = Watch(t, Margins(dataclasses.replace(t.problem, terms=())), first_iterate(t)).constraints(0.15)
     assert len(rows) > 100
+    check_rows(t.with_clearance(rows))
+
+
+def test_of_bodies_that_are_kept_apart_from_a_target_that_friction_pushes_aside() -> None:
+    rough = ContactFriction(coefficient=0.6, moves_target=True)
+    t = transcribed(dataclasses.replace(arm_problem(), friction=rough))
+    x, margins = away_from_start(t), Margins(dataclasses.replace(t.problem, terms=()))
+    plan, spots = t.decode(x), node_placements(t, x)
+    rows = Watch(t, margins, x).constraints(0.5)
+    moved = {key.place: held.aside for key, held in rows.items() if np.any(held.aside)}
+    assert moved
+    for place, aside in moved.items():
+        since = spots.time[spots.names.index(place)] - plan.contact_end
+        velocity = plan.collision.tangential_velocity[-1]
+        np.testing.assert_allclose(aside - since * velocity, plan.aside(np.array([plan.contact_end]))[0])
     check_rows(t.with_clearance(rows))
 
 
@@ -154,8 +171,10 @@ def test_of_a_board_whose_events_have_an_order(
     monkeypatch.setattr("impactopt.transcription.contact_guess.SPEED_STEPS", 0)
     board = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
     order = touches if isinstance(touches, int) else tuple(ENDS[letter] for letter in touches)
-    stiff = law(stiffness=1e6, damping=50.0)
-    check_rows(transcribed(dataclasses.replace(arm_problem(), target=board, law=stiff, touches=order)))
+    stiff, rough = law(stiffness=1e6, damping=50.0), ContactFriction(coefficient=0.6, stiffness=8e5)
+    problem = dataclasses.replace(arm_problem(), target=board, law=stiff, touches=order)
+    for friction in (None, rough):
+        check_rows(transcribed(dataclasses.replace(problem, friction=friction)))
 
 
 def test_of_a_slide_that_is_bounded() -> None:

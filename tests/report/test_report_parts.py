@@ -367,6 +367,23 @@ def test_a_track_says_what_the_record_says(record: Record, solution: Solution) -
     assert planned.travel[-1] == pytest.approx(min(2.0 * (0.02 + end), FAR), abs=1e-3)
 
 
+def test_a_target_that_friction_pushes_aside_is_drawn_there(record: Record, solution: Solution) -> None:
+    a, across = record.arrays, np.array([0.0, 0.5, -0.2])
+    time = a["collision_time"]
+    histories = {"collision_tangential_velocity": np.outer(time / time[-1], across)}
+    histories["replayed_target_aside"] = np.outer(a["replayed_time"], across)
+    for track in tracks_of(record, solution.problem):
+        assert not track.aside.any()
+    moved = dataclasses.replace(record, arrays={**a, **histories})
+    planned, *_, free = tracks_of(moved, solution.problem)
+    since = planned.time[-1] - planned.contact_start
+    # the velocity grows linearly in contact, and stays
+    np.testing.assert_allclose(planned.aside[-1], (since - time[-1] / 2) * across, atol=1e-3)
+    np.testing.assert_allclose(free.aside, np.outer(free.time, across), atol=1e-9)
+    _, arrays = stage_of(moved, solution.problem)
+    assert any(name.endswith("_aside") and np.any(values) for name, values in arrays.items())
+
+
 def test_the_motion_for_a_missing_target_is_there_without_the_target(
     record: Record, solution: Solution
 ) -> None:

@@ -191,8 +191,8 @@ def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any,
         at = [coal.Transform3s(*bodies.placement(spots.at, k, body)) for body in (row.joint, row.other)]
         if row.other < 0:  # they know where the target was when they were made
             body = bodies.world[-1 - row.other]
-            shift = body.place + held.travel * bodies.normal * body.moves
-            at[1] = coal.Transform3s(body.rotation, shift)
+            place = held.placed(body, bodies.normal)
+            at[1] = coal.Transform3s(place.rotation, place.translation)
         apart = coal.distance(one, at[0], two, at[1], coal.DistanceRequest(), coal.DistanceResult())
         what = " and ".join(bodies.names((row.joint, row.other)))
         term = SelfCollision.name if row.other >= 0 else KeepOut.name

@@ -247,7 +247,7 @@ class View {
     }
     for (const sole of header.legged ? this.soles : []) this.put(sole, still, themeColour("muted"), 1, 0.6);
     const poses = this.bodies.map((body) => this.pose(now, body.joint));
-    const world = this.surroundings(now.mix("travel", 1)[0], track.missing);
+    const world = this.surroundings(now.mix("travel", 1)[0], track.missing, now.mix("aside", 3));
     if (header.legged) this.shadow(poses, world);
     gl.depthMask(true);
 
@@ -287,11 +287,11 @@ class View {
 
   // where the bodies of the world are after the target's travel: it moves on, and a board's halves tip over;
   // where the target is missing, so is what holds it
-  surroundings(travel, missing) {
+  surroundings(travel, missing, aside = [0, 0, 0]) {
     const seen = this.seen(travel), out = [];
     for (const part of this.world) {
       if (part.kind === "obstacle" ? !this.shown.obstacles : missing) continue;
-      let place = scaled(part.moves ? this.header.normal.map((x) => x * travel) : [0, 0, 0], 1);
+      let place = scaled(part.moves ? this.header.normal.map((x, k) => x * travel + aside[k]) : [0, 0, 0], 1);
       if (part.hinge) {
         const { place: at, axis, arm } = part.hinge, half = Math.atan2(travel, arm) / 2;
         const turn = rigid([0, 0, 0], [...axis.map((x) => x * Math.sin(half)), Math.cos(half)]);

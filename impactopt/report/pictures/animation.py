@@ -73,7 +73,10 @@ class _Drawing:
         ends = [model.frames[model.getFrameId(name)].parentJoint for name in self.scene.strikers]
         chain = {joint for end in ends for joint in model.supports[end]}
         self.strikes = np.array([j in chain for _, j in self.links])
-        self.travel = self.sim.travel()
+        travel = self.sim.travel()
+        self.travel, self.aside = travel, np.zeros((len(travel), 3))
+        if len(self.sim.target_aside):
+            self.aside = self.sim.target_aside
         self.figure = Figure(figsize=(9.4, 4.2), dpi=80)
         self.canvas: Any = FigureCanvasAgg(self.figure)
         self.panels: list[Any] = []
@@ -101,7 +104,11 @@ class _Drawing:
             if is_loaded
         ]
         world = [
-            (part, part.placed(self.travel[k], scene.normal) + (part.kind != "obstacle") * self.shift)
+            (
+                part,
+                part.placed(self.travel[k], scene.normal, self.aside[k])
+                + (part.kind != "obstacle") * self.shift,
+            )
             for part in self.world
             if part.kind == "obstacle" or not self.done.perturbation.missing
         ]
@@ -112,7 +119,9 @@ class _Drawing:
             hand=hand,
             world=[vertices for _, vertices in world],
             near=[v for part, v in world if not part.clear and np.linalg.norm(v.mean(axis=0) - hand) < NEAR],
-            face=None if self.done.perturbation.missing else scene.point + self.travel[k] * scene.normal,
+            face=None
+            if self.done.perturbation.missing
+            else scene.point + self.travel[k] * scene.normal + self.aside[k],
             push=self.per_push * sim.force[k] * scene.normal,
             feet=feet,
             zmp=np.array([*zmp, 0.0]) if np.isfinite(zmp).all() else None,

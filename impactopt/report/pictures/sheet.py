@@ -92,7 +92,7 @@ def _around(track: Track, k: int, world: list[Part], normal: Array) -> list[Show
     """The world at an instant of a track."""
     shown = []
     for part in world:
-        corners = part.placed(float(track.travel[k]), normal)[part.solid.triangles]
+        corners = part.placed(float(track.travel[k]), normal, track.aside[k])[part.solid.triangles]
         if abs(track.travel[k]) < MAX_TRAVEL or not part.moves:
             shown.append((corners, _normals(corners), np.tile(to_rgb(PARTS[part.kind]), (len(corners), 1))))
     return shown

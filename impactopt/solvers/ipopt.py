@@ -17,6 +17,7 @@ import scipy.sparse as sp
 
 from impactopt.errors import InputError, check_array
 from impactopt.solvers.program import (
+    PATTERN_CHANGED,
     BestIterate,
     Callback,
     IterationRecord,
@@ -56,9 +57,7 @@ class Pattern:
         if not self._same(matrix):
             matrix = _canonical(matrix)  # unsorted or with duplicates
             if not self._same(matrix):
-                raise InputError(
-                    "a derivative of the program changed its sparsity pattern; keep structural zeros explicit"
-                )
+                raise InputError(PATTERN_CHANGED)
         values: Vector = matrix.data
         return values if self._upper is None else values[self._upper]
 

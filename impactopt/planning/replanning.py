@@ -391,7 +391,11 @@ def _by_active_set(solution: Solution, t: Transcription, family: ParametricProgr
         best, worst, steps = at, violation, taken + 1
         if worst <= _SMALL_VIOLATION:
             break
-    assert best is not None
+    if best is None:
+        raise InputError(
+            "the constraints are not finite at the first-order plan: the change is too large for it; use "
+            "moved with polish=True, or solve(problem, start=solution)"
+        )
     # a multiplier of the wrong sign: its inequality or bound is no longer active
     inequality, free = program.g_lower < program.g_upper, program.x_lower < program.x_upper
     released_y, released_z = (

@@ -17,6 +17,7 @@ import scipy.sparse as sp
 
 from impactopt.errors import InputError, check_array
 from impactopt.solvers.program import (
+    PATTERN_CHANGED,
     BestIterate,
     Callback,
     IterationRecord,
@@ -24,6 +25,7 @@ from impactopt.solvers.program import (
     NonlinearProgram,
     SolverResult,
     Status,
+    TimedProgram,
     Vector,
     check_program,
     explain,
@@ -56,9 +58,7 @@ class Pattern:
         if not self._same(matrix):
             matrix = _canonical(matrix)  # unsorted or with duplicates
             if not self._same(matrix):
-                raise InputError(
-                    "a derivative of the program changed its sparsity pattern; keep structural zeros explicit"
-                )
+                raise InputError(PATTERN_CHANGED)
         values: Vector = matrix.data
         return values if self._upper is None else values[self._upper]
 
@@ -92,7 +92,8 @@ class Functions:
     def start(self, x0: Vector) -> None:
         """Consider the initial guess, so that there always is an iterate to return."""
         x0 = np.clip(x0, self.program.x_lower, self.program.x_upper)
-        self.best.consider(x0, float(self.program.objective(x0)), self.program.constraints(x0))
+        point = TimedProgram(self.program).point(x0)
+        self.best.consider(x0, point.objective, point.g)
         # Not finite there: still the only point to return.
         if self.best.x is None:
             self.best.x = x0
@@ -355,31 +356,31 @@ def _result(
     functions.release()
     if not status.usable and best.x is not None:
         x = best.x
-    g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
-    violation = max_violation(program, x, g)
+    point = TimedProgram(program).point(x)
     if (
         status is Status.FAILED
-        and violation > functions.tolerance
-        and is_stationary_violation(program, x, g, jacobian)
+        and point.max_violation > functions.tolerance
+        and point.differentiable
+        and is_stationary_violation(program, x, point.g, point.jacobian)
     ):
         status = Status.INFEASIBLE  # IPOPT's restoration phase often fails at such points
-    message = explain(program, status, x, g, tolerance=functions.tolerance)
+    message = explain(program, status, x, point.g, tolerance=functions.tolerance)
     if status is Status.FAILED:
         message += f" IPOPT: {outcome.replace('_', ' ')}."
-        if not np.isfinite(violation):
+        if not point.finite:
             message += " The program's functions are not finite there."
     return SolverResult(
         x=x,
         multipliers=y,
         bound_multipliers=z,
-        objective=float(program.objective(x)),
+        objective=point.objective,
         status=status,
         iterations=max(len(progress.history) - 1, 0),
         seconds=time.perf_counter() - start,
         seconds_functions=functions.seconds,
         seconds_qp=0.0,
-        max_violation=violation,
-        kkt=stationarity(gradient, jacobian, y, z),
+        max_violation=point.max_violation,
+        kkt=stationarity(point.gradient, point.jacobian, y, z) if point.differentiable else np.nan,
         message=message,
         history=tuple(progress.history),
     )

@@ -41,7 +41,7 @@ class SolverOptions:
 
         Raises
         ------
-        InputError : an unknown name, or a number out of its range.
+        InputError : a value of another type, or a number out of its range.
         """
         for option in fields(self):
             value, default = getattr(self, option.name), option.default
@@ -70,7 +70,7 @@ class IPMOptions(SolverOptions):
     complementarity_tolerance : largest product of a multiplier and the distance to its bound at a solution.
     barrier : initial barrier parameter for an initial guess without multipliers.
     barrier_warm : the same with multipliers; below 5e-3 it falls at once near a solution.
-    push : distance by which the initial guess is moved inside its bounds.
+    push : distance by which the initial guess is moved inside its bounds; half way between two at most.
     push_warm : the same with multipliers, at most, over the barrier.
     """
 

@@ -257,7 +257,9 @@ class Predictor:
         return np.concatenate([program.g_lower, lower]), np.concatenate([program.g_upper, upper])
 
     def predict(self, program: NonlinearProgram) -> Prediction | None:
-        """Prediction for the same program with other parameters; None if a QP's active set is not found.
+        """Prediction for the same program with other parameters.
+
+        None if the first QP is not solved, or the constraints are not finite at its solution.
 
         Each QP is linearized at the last one's solution; they end if constraints are met, or not met better.
         """
@@ -275,7 +277,7 @@ class Predictor:
                 x = np.clip(x + qp.d, program.x_lower, program.x_upper)
                 (y, z), sides, g = qp.multipliers(), qp.sides, program.constraints(x)
                 violation = max_violation(program, x, g)
-                if found is not None and not violation < found.violation:
+                if not violation < (np.inf if found is None else found.violation):
                     break
                 found = Prediction(x=x, y=y, z=z, violation=violation, steps=k + 1)
                 if violation <= _SUFFICIENT_VIOLATION:
@@ -319,7 +321,10 @@ class _QP:
         return out
 
     def solve(self, sides: Sides) -> bool:
-        """Find the solution's active set by Newton steps from another one; False if they stall."""
+        """Find the solution's active set by Newton steps from another one; False if they stall.
+
+        If the active set still changes after `_MAX_ACTIVE_SETS` steps, the last step counts as the solution.
+        """
         i, short = self._of._unequal, 0
         at = np.zeros(len(i))  # change of the inequalities' linearized values by d
         for k in range(_MAX_ACTIVE_SETS):
@@ -360,18 +365,15 @@ class _QP:
         off[i[active]] = self._values[active] - bound + self._own[active] / _WEIGHT
         of_free = weights[m:] * of._free  # a diagonal, as these bounds are no constraints of the condenser
         condensed = np.concatenate([weights[:m], weights[m:][c.bounded]])[c.remaining]
-        try:
-            factored = self._newton.factor(
-                self._jacobian,
-                of._hessian,
-                of_free[c.free],
-                # Unlike those of a barrier's slacks, these weights do not depend on the shift.
-                lambda shift: condensed,
-                hard=True,
-                proximal=_PROXIMAL,
-            )
-        except np.linalg.LinAlgError:
-            return None
+        factored = self._newton.factor(
+            self._jacobian,
+            of._hessian,
+            of_free[c.free],
+            # Unlike those of a barrier's slacks, these weights do not depend on the shift.
+            lambda shift: condensed,
+            hard=True,
+            proximal=_PROXIMAL,
+        )
         if not factored:
             return None
         d, found = self._newton.solve(

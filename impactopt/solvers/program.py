@@ -23,6 +23,9 @@ Vector = npt.NDArray[np.float64]
 Matrix = Any  # scipy.sparse.csc_array; SciPy ships no types
 
 
+PATTERN_CHANGED = "a derivative of the program changed its sparsity pattern; keep structural zeros explicit"
+
+
 class Determined(NamedTuple):
     """Variables, by number, that equalities determine; those of lower rank are eliminated first.
 
@@ -69,7 +72,7 @@ class NonlinearProgram(Protocol):
         ...
 
     def jacobian(self, x: Vector) -> Matrix:
-        """dg/dx as scipy.sparse.csc_array (m, n), with the same pattern at every x."""
+        """dg/dx as scipy.sparse.csc_array (m, n), without duplicates, with the same pattern at every x."""
         ...
 
     def hessian(self, x: Vector, sigma: float, multipliers: Vector) -> Matrix:
@@ -221,9 +224,8 @@ def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
     for kind, size, name in sides:
         lower = check_array(f"{kind}_lower", getattr(program, f"{kind}_lower"), (size,), finite=False)
         upper = check_array(f"{kind}_upper", getattr(program, f"{kind}_upper"), (size,), finite=False)
-        # ~(a <= b), as NaN fails that too
         # A lower bound of inf, or an upper one of -inf, leaves no value either.
-        bad = np.flatnonzero(~((lower <= upper) & (lower < np.inf) & (upper > -np.inf)))
+        bad = np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf))
         if bad.size:
             i = int(bad[0])
             raise InputError(
@@ -380,7 +382,6 @@ class BestIterate:
     def __init__(self, program: NonlinearProgram, tolerance: float):
         self._program, self._tolerance = program, tolerance
         self.x: Vector | None = None
-        self.g: Vector | None = None
         self.objective = np.inf
         self.violation = np.inf
 
@@ -393,7 +394,7 @@ class BestIterate:
         rank = (max(violation, self._tolerance), objective)
         if self.x is not None and rank >= (max(self.violation, self._tolerance), self.objective):
             return False
-        self.x, self.g, self.objective, self.violation = x.copy(), g.copy(), objective, violation
+        self.x, self.objective, self.violation = x.copy(), objective, violation
         return True
 
 

@@ -160,7 +160,7 @@ class Watch(Protocol):
 class Run(ABC, Generic[_Options]):
     """One solve: the program, the present point, and its multipliers.
 
-    x0 : initial guess (n,); moved into the variables' bounds, where every iterate stays.
+    x0 : initial guess (n,); moved into the variables' bounds.
     y, z : initial guess of the multipliers of constraints (m,) and of bounds (n,); None: zero.
 
     Attributes

@@ -25,10 +25,12 @@ from impactopt import (
     load_problem,
     solve,
 )
+from impactopt.planning import replanning
 from impactopt.planning.budget import Budget
 from impactopt.planning.parameter_changes import changed, parameter_of
 from impactopt.planning.replanning import parametric_program
 from impactopt.planning.solution import program_on
+from impactopt.solvers.predictor import Predictor
 from impactopt.solvers.program import SolverResult
 
 TIGHT: dict[str, Any] = {"kkt_tolerance": 1e-8, "complementarity_tolerance": 1e-8}
@@ -210,3 +212,10 @@ def test_a_plan_that_was_moved_is_freed(arm: Solution) -> None:
     del solution
     gc.collect()
     assert known() is None
+
+
+def test_a_first_order_plan_without_finite_constraints_is_refused(arm: Solution, monkeypatch: Any) -> None:
+    monkeypatch.setattr(Predictor, "predict", lambda self, program: None)
+    monkeypatch.setattr(replanning, "max_violation", lambda program, x, g: np.inf)
+    with pytest.raises(InputError, match="not finite"):
+        arm.moved(polish=False, stiffness=6e5)

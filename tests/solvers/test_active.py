@@ -106,3 +106,9 @@ def test_unchanged_parameters_predict_the_solution() -> None:
     z = np.array([p.aim[0] - x[0] - y, 0.0])
     found = Predictor(p, x, np.array([y]), z).predict(p)
     assert found is not None and found.x == pytest.approx(x, abs=1e-9)
+
+
+def test_constraints_that_are_not_finite_at_the_solution_give_no_prediction() -> None:
+    old, new = Nearest(2.0, 1.0, 1.5, 1.2), Nearest(2.0, 1.0, 1.5, 0.9)
+    new.constraints = lambda x: np.array([x.sum() if x[0] > 1.0 else np.nan])  # type: ignore[method-assign]
+    assert Predictor(old, *solved(old)).predict(new) is None

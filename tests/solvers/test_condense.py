@@ -227,6 +227,18 @@ def test_the_factor_in_blocks_against_dense_algebra(algebra, seed, n, wide):
     assert not matrix.factor(values(K - 1.01 * np.linalg.eigvalsh(K)[-1] * np.eye(n)))
 
 
+def test_more_columns_than_variables_are_solved_for(algebra):
+    """As with many equalities that depend on each other."""
+    K = 3 * np.eye(40) + np.eye(40, k=1) + np.eye(40, k=-1)
+    i, j = np.nonzero(np.tril(K))
+    matrix = BlockCholesky(K != 0.0, algebra)
+    values = np.zeros(matrix.size)
+    values[matrix.places(i, j)] = K[i, j]
+    assert matrix.factor(values)
+    right = np.random.default_rng(0).normal(size=(40, 50_000))
+    np.testing.assert_allclose(K @ matrix.solve(right), right, atol=1e-12)
+
+
 def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one(algebra, biped_transcription):
     t = biped_transcription
     p = t.program

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
+import threading
 
 import casadi as ca
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.small_plans import changed, transcribed
 from support.textbook import CASES, INF, Textbook, assert_optimal
 
-from impactopt import Status, load_problem
+from impactopt import InputError, Status, load_problem
 from impactopt.solvers.ipm import IPMOptions, interior_point, solve_ipm
-from impactopt.solvers.program import max_violation
+from impactopt.solvers.program import Determined, max_violation
 from impactopt.transcription.initial_guess import first_iterate
 
 
@@ -174,3 +177,150 @@ def test_a_loose_stationarity_leaves_constraints_met(name):
     result = solve_ipm(program, case.x0, options=IPMOptions(kkt_tolerance=1e-2, violation_tolerance=1e-7))
     assert result.status is Status.SOLVED
     assert max_violation(program, result.x, program.constraints(result.x)) <= 1e-7
+
+
+@pytest.mark.parametrize("bad", ["raises", "is nan"])
+def test_a_hessian_that_cannot_be_computed_is_a_failure(bad):
+    class Bad(Textbook):
+        def hessian(self, x, sigma, multipliers):
+            found = super().hessian(x, sigma, multipliers)
+            if self.evaluations["hessian"] > 3:
+                if bad == "raises":
+                    raise ZeroDivisionError
+                found.data[:] = np.nan
+            return found
+
+    case = CASES["HS71"]
+    program = case.build()
+    program.__class__ = Bad
+    result = solve_ipm(program, case.x0)
+    assert result.status is Status.FAILED
+    assert np.isfinite(result.x).all()
+
+
+def test_a_changing_pattern_is_an_error():
+    """A dropped zero would shift all entries after it."""
+
+    class Dropping(Textbook):
+        def jacobian(self, x):
+            found = super().jacobian(x).tolil()
+            if self.evaluations["jacobian"] > 2:
+                found[0, 0] = 0
+            return sp.csc_array(found)
+
+    case = CASES["HS43"]
+    program = case.build()
+    program.__class__ = Dropping
+    with pytest.raises(InputError, match="pattern"):
+        solve_ipm(program, case.x0)
+
+
+def test_a_determined_variable_that_is_fixed_does_not_move():
+    program = Textbook(
+        2, lambda x, y: (y - 3) ** 2, lambda x, y: [(0.0, x - y, 0.0)], lower=[1, -INF], upper=[1, INF]
+    )
+    program.determined = [Determined((0,), np.array([0]))]
+    result = solve_ipm(program, [1.0, 0.0])
+    assert result.status is Status.SOLVED
+    assert result.x == pytest.approx([1.0, 1.0], abs=1e-6)
+
+
+def test_equalities_may_determine_all_variables():
+    program = Textbook(2, lambda x, y: x, lambda x, y: [(1.0, x + y, 1.0), (0.0, x - y, 0.0)])
+    program.determined = [Determined((0,), np.array([0, 1]))]
+    result = solve_ipm(program, [0.0, 0.0])
+    assert result.status is Status.SOLVED
+    assert result.x == pytest.approx([0.5, 0.5], abs=1e-9)
+
+
+def test_a_long_push_ends_half_way_between_the_bounds():
+    program = Textbook(2, lambda x, y: (x - 0.2) ** 2 + (y - 3) ** 2, lower=0, upper=1)
+    result = solve_ipm(program, [1.0, 0.0], options=IPMOptions(push=2.0))
+    assert result.status is Status.SOLVED
+    assert result.x == pytest.approx([0.2, 1.0], abs=1e-4)
+
+
+def test_a_constraint_without_bounds_changes_no_infeasible_program():
+    rows = [(5.0, lambda x, y: x**2 + y**2, INF), (-INF, lambda x, y: x**2 + y**2, 1.0)]
+    free = (-INF, lambda x, y: x - y, INF)
+    for several in (rows, [free, *rows]):
+        program = Textbook(
+            2,
+            lambda x, y: (y - 3) ** 2 + (x - 0.2) ** 2,
+            lambda x, y, several=several: [(low, of(x, y), high) for low, of, high in several],
+            lower=-4,
+            upper=4,
+        )
+        result = solve_ipm(program, [1.0, 0.0])
+        assert result.status is Status.INFEASIBLE
+        # Between both levels all points have the same sum of violations.
+        assert 1.0 - 1e-3 <= np.sum(result.x**2) <= 5.0 + 1e-3
+
+
+def test_too_many_changes_of_the_aim_are_a_failure(monkeypatch):
+    """Elastic constraints that are met would become hard, and may not: the solve must not go on in place."""
+    monkeypatch.setattr(interior_point, "_SHORT_STEP", 2.0)
+    monkeypatch.setattr(interior_point, "_MAX_SHORT_STEPS", 2)
+    monkeypatch.setattr(interior_point, "_MAX_MET_ITERATIONS", 0)
+    monkeypatch.setattr(interior_point, "_MAX_CHANGES", 0)
+    monkeypatch.setattr(interior_point, "_MAX_RESTARTS", 0)
+    result = solve_ipm(projection(np.full(3, 5.0)), np.ones(3))
+    assert result.status is Status.FAILED
+    assert result.iterations < 20
+
+
+class LimitWatch(HalvingWatch):
+    """Watch that permits no step of more than this size."""
+
+    def __init__(self, most: float) -> None:
+        super().__init__(-1)
+        self.most = most
+
+    def limit(self, x, step, most):
+        return min(most, self.most / np.abs(step).max())
+
+
+def test_a_watch_limits_corrected_steps():
+    case, watch = CASES["Maratos"], LimitWatch(0.3)
+    result = solve_ipm(case.build(), case.x0, watch=watch)
+    assert result.status is Status.SOLVED
+    assert any("corrections" in record.note for record in result.history)
+    assert np.abs(np.diff(watch.asked, axis=0)).max() <= 0.3 * (1 + 1e-9)
+
+
+def test_solves_may_run_in_threads():
+    """Programs with the same equalities share Newton systems, but one at a time."""
+
+    def program(number):
+        normals = np.random.default_rng(number).normal(size=(1 + number, 6))
+        found = Textbook(
+            6,
+            lambda *x: ca.sumsqr(ca.vertcat(*x) - 2),
+            lambda *x: [
+                (0.0, x[0] - x[1] - x[2], 0.0),
+                *[(-INF, ca.dot(ca.DM(normal), ca.vertcat(*x)), 1.0) for normal in normals],
+            ],
+        )
+        found.determined = [Determined((0,), np.array([0]))]
+        return found
+
+    programs = [program(k) for k in range(5)]
+    wanted = [solve_ipm(p, np.zeros(6)).x for p in programs]
+    found = []
+
+    def solve_all(seed):
+        for k in np.random.default_rng(seed).integers(0, 5, size=15):
+            found.append(np.abs(solve_ipm(programs[k], np.zeros(6)).x - wanted[k]).max())
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        workers = [threading.Thread(target=solve_all, args=(seed,)) for seed in range(4)]
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert len(found) == 60
+    assert max(found) < 1e-5

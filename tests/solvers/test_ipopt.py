@@ -203,3 +203,15 @@ def test_functions_not_finite_at_the_start_are_said_so():
     result = solve_ipopt(Textbook(1, lambda x: ca.log(x), lambda x: [(0, ca.sqrt(x), 1)]), [-1.0])
     assert result.status is Status.FAILED
     assert "not finite" in result.message
+
+
+def test_functions_that_raise_at_the_start_are_said_so():
+    class Fussy(Textbook):
+        def objective(self, x):
+            if x[0] <= 0:
+                raise ZeroDivisionError
+            return super().objective(x)
+
+    result = solve_ipopt(Fussy(1, lambda x: x - ca.log(x)), [-8.0])
+    assert result.status is Status.FAILED
+    assert "not finite" in result.message

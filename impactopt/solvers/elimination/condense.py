@@ -21,8 +21,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
+from impactopt.errors import InputError
 from impactopt.solvers.elimination.kernels import EliminationStage, Index, Kernels, Places, Products
-from impactopt.solvers.program import Determined, Matrix, Vector
+from impactopt.solvers.program import PATTERN_CHANGED, Determined, Matrix, Vector
 
 
 class Elimination(NamedTuple):
@@ -413,7 +414,7 @@ class Condenser:
         at = np.flatnonzero(row == column)
         self._curved = at, row[at]
         self._own_jacobian = np.flatnonzero(equal[jacobian.indices]).astype(np.int32), self._to
-        self._equations = np.flatnonzero(equal)
+        self._equations, self._entries = np.flatnonzero(equal), (jacobian.nnz, hessian.nnz)
         self.eliminated = self._equations[self._taken]
         self.m = equal.size + self.bounded.size
         self.remaining = np.setdiff1d(np.arange(self.m), self.eliminated)
@@ -427,7 +428,11 @@ class Condenser:
         Raises
         ------
         LinAlgError : constraints do not determine their variables.
+        InputError : a matrix with another number of entries than its pattern.
         """
+        # Places outside the values would be read in C.
+        if (jacobian.nnz, hessian.nnz) != self._entries:
+            raise InputError(PATTERN_CHANGED)
         self._jacobian, self._hessian = (
             np.ascontiguousarray(a.data, dtype=float) for a in (jacobian, hessian)
         )

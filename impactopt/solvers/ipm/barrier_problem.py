@@ -71,8 +71,9 @@ class Bounded:
 
     def _pushed_inside(self, values: Vector, push: float) -> Vector:
         has_lower, has_upper, low, high = self._has_lower > 0, self._has_upper > 0, self._lower, self._upper
-        # min(kappa_1 max(1, |bound|), kappa_2 (upper - lower)) of section 3.6, with kappa_1 = kappa_2 = push.
-        room = np.where(has_lower & has_upper, push * (high - low), np.inf)
+        # min(kappa_1 max(1, |bound|), kappa_2 (upper - lower)) of section 3.6, with kappa_1 = kappa_2 = push;
+        # but kappa_2 is one half at most, as both limits would else cross.
+        room = np.where(has_lower & has_upper, min(push, 0.5) * (high - low), np.inf)
         least = low + np.minimum(push * np.maximum(1.0, np.abs(low)), room)
         most = high - np.minimum(push * np.maximum(1.0, np.abs(high)), room)
         return np.clip(values, np.where(has_lower, least, -np.inf), np.where(has_upper, most, np.inf))
@@ -354,6 +355,7 @@ _PROXIMAL = 1.0
 _NEWTON_TOLERANCE = 0.1  # times mu: largest residual of a Newton step's equations
 _PUSH_CONTINUED = 1e-9  # into bounds, if an earlier solve is continued: its iterate is inside them already
 _MIN_NEW_SLACK = 1e-3  # distance to the lower bound, of a constraint that the earlier solve did not have
+_MIN_STIFFNESS = 1e-300  # of slacks without bounds, which would have none while constraints are elastic
 _S_MAX = 100.0  # mean multiplier beyond which errors are scaled (eq. 5 and 6)
 
 
@@ -411,7 +413,7 @@ class BarrierProblem:
 
         state : the state of an earlier solve, to be continued.
         """
-        self.program, self.options, self.warm = program, options, warm
+        self.program, self.options = program, options
         self._lower_at_once = warm and state is None and options.barrier_warm < _MIN_BARRIER_OF_PATH
         self.sigma = 1.0
         self.mu = options.barrier_warm if warm else options.barrier
@@ -458,8 +460,7 @@ class BarrierProblem:
         slacks = self._values(point)
         if state is not None:
             saved = np.concatenate([state.constraints, state.variables[c.bounded]])
-            least = np.where(np.isfinite(all_lower), all_lower, -np.inf) + _MIN_NEW_SLACK
-            slacks = np.where(np.isnan(saved), np.maximum(slacks, least), saved)
+            slacks = np.where(np.isnan(saved), np.maximum(slacks, all_lower + _MIN_NEW_SLACK), saved)
         self.s = Bounded(
             slacks[c.remaining][self._unequal],
             lower[self._unequal],
@@ -564,11 +565,15 @@ class BarrierProblem:
 
     # ------------------------------------------------------------------ Newton step
     def step(self, residual: Vector) -> Step | None:
-        """Newton step; None if its matrix cannot be factored."""
+        """Newton step; None if the Hessian cannot be computed, or the matrix not be factored."""
         point, hard = self.point, self.elastic is None
+        try:
+            hessian = self.program.hessian(point.x, self.sigma, self.constraint_multipliers)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            return None
         factored = self.newton.factor(
             point.jacobian,
-            self.program.hessian(point.x, self.sigma, self.constraint_multipliers),
+            hessian,
             self.x.hessian_diagonal(),
             self._weights,
             hard=hard,
@@ -585,7 +590,7 @@ class BarrierProblem:
         compliance, self._offsets = np.zeros((2, self._condenser.remaining.size))
         # A slack's own equation is y = gradient + stiffness ds. With J d + r = ds it becomes
         # y = stiffness (J d + r + gradient / stiffness): a weight and an offset, and no slack in the matrix.
-        self._stiffness = self.s.hessian_diagonal() + shift
+        self._stiffness = np.maximum(self.s.hessian_diagonal() + shift, _MIN_STIFFNESS)
         compliance[self._unequal] = 1.0 / self._stiffness
         self._offsets[self._unequal] = self.s.barrier_gradient(self.mu) / self._stiffness
         if self.elastic is not None:
@@ -666,8 +671,8 @@ class BarrierProblem:
         x, s, mu, tau = self.x, self.s, self.mu, self.tau
         below_x, above_x, dual_x = x.dual_step(step.free, mu, tau)
         below_s, above_s, dual_s = s.dual_step(step.slack, mu, tau)
-        # the constraints' multipliers move as far as the variables, those of bounds as far as they can (eq.
-        # 14)
+        # The constraints' multipliers move as far as the variables, those of bounds as far as they can
+        # (eq. 14).
         dual_length, y_length = min(dual_x, dual_s), length
         if self.elastic is not None:
             dual_length = min(dual_length, self.elastic.max_dual_length(step.y, self.y, tau))

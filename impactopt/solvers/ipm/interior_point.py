@@ -85,7 +85,7 @@ class LineSearch:
         """
         # Slacks and variables limit `longest`; the watch may permit more, which only a bent step can use.
         longest = problem.max_length(step)
-        limit = self._limit(problem, step, longest)
+        limit = self._limit(problem, step, problem.x.max_length(step.free, problem.tau))
         self.held_back = limit < _HELD_BACK * longest
         longest = min(longest, limit)
         start = problem.search_start(step, residual)
@@ -96,7 +96,7 @@ class LineSearch:
         # A bent step is longer than all that backtracking can find, so it is tried first.
         accepted = _bent_step(problem, pairs, step, start, longest, limit)
         if accepted is None:
-            accepted = _backtrack(problem, pairs, step, start, longest, residual)
+            accepted = self._backtrack(problem, pairs, step, start, longest, residual)
         short = accepted is None or accepted.length < _SHORT_STEP
         self._short_steps = self._short_steps + 1 if short else 0
         if accepted is None or self._short_steps > _MAX_SHORT_STEPS:
@@ -105,16 +105,72 @@ class LineSearch:
         pairs.augment(start, accepted.length, accepted.trial.phi)
         return accepted
 
-    def _limit(self, problem: BarrierProblem, step: Step, longest: float) -> float:
-        """Largest length that the watch permits; the variables' bounds are respected, slacks may be bent."""
-        limit = max(longest, problem.x.max_length(step.free, problem.tau))
-        return limit if self._watch is None else self._watch.limit(problem.point.x, step.d, limit)
+    def _limit(self, problem: BarrierProblem, step: Step, most: float) -> float:
+        """Largest length of a step, ``most`` at most, that the watch permits."""
+        return most if self._watch is None else self._watch.limit(problem.point.x, step.d, most)
+
+    def _backtrack(
+        self,
+        problem: BarrierProblem,
+        pairs: Filter,
+        step: Step,
+        start: SearchStart,
+        longest: float,
+        residual: Vector,
+    ) -> AcceptedStep | None:
+        """Halve the step length until the filter accepts the point; None below the least length."""
+        # Each halving costs an evaluation of f and g, no derivatives and no factorization.
+        length, trials = longest, 0
+        while True:
+            trials += 1
+            trial = problem.trial(step, length)
+            if _is_acceptable(pairs, start, length, trial):
+                return AcceptedStep(step, trial, length, [])
+            # only a first trial with more violation is corrected (step A-5.5): a shorter one is nearly linear
+            if trials == 1 and trial.theta >= start.theta and problem.options.second_order_correction:
+                accepted = self._second_order_correction(problem, pairs, start, residual, trial, longest)
+                if accepted is not None:
+                    return accepted
+            length *= 0.5
+            if length < pairs.min_length(start):
+                return None
+
+    def _second_order_correction(
+        self,
+        problem: BarrierProblem,
+        pairs: Filter,
+        start: SearchStart,
+        residual: Vector,
+        trial: Trial,
+        longest: float,
+    ) -> AcceptedStep | None:
+        """Steps for the residual that a refused trial point leaves, while they reduce it (section 2.4)."""
+        # p and n take up what the linearization misses (`Elastic.move`).
+        if problem.elastic is not None:
+            return None
+        corrected_residual, theta = residual, trial.theta
+        for k in range(_MAX_CORRECTIONS):
+            if not trial.point.finite:
+                break
+            # c_soc = alpha c(x) + c(x + alpha d) (section 2.4): the same matrix, another right-hand side. The
+            # paper has the alpha of the correction before (A-5.9), ours that of the first trial; on 60 random
+            # programs of four variables the one took 867 iterations, the other 856.
+            corrected_residual = longest * corrected_residual + problem.residual(trial.point, trial.slack)
+            step = problem.step_for(corrected_residual)
+            trial = problem.trial(step, self._limit(problem, step, problem.max_length(step)))
+            # As for a first trial: by its length, from the same start (A-5.7).
+            if _is_acceptable(pairs, start, longest, trial):
+                return AcceptedStep(step, trial, longest, [f"{k + 1} corrections"])
+            if trial.theta > _KAPPA_SOC * theta:
+                break
+            theta = trial.theta
+        return None
 
 
 def _bent_step(
     problem: BarrierProblem, pairs: Filter, step: Step, start: SearchStart, longest: float, limit: float
 ) -> AcceptedStep | None:
-    """Step as long as the variables' bounds permit, in which every slack stops by itself short of its bound.
+    """Step of the length ``limit``, in which every slack stops by itself short of its bound.
 
     Of thousands of slacks one is always close to its bound and would stop all variables and slacks (TALOS's
     punch takes 60 iterations with bent steps, 75 without). The constraints whose slacks stopped are violated
@@ -123,68 +179,15 @@ def _bent_step(
     """
     if problem.elastic is not None or problem.point.max_violation > _MAX_BENT_VIOLATION:
         return None
-    length = min(limit, problem.x.max_length(step.free, problem.tau))
-    if length <= _MIN_BENT_GAIN * longest:
+    if limit <= _MIN_BENT_GAIN * longest:
         return None
-    slack = problem.s.clipped(problem.s.values + length * step.slack, _BENT_SLACK_FRACTION)
-    trial = problem.trial(step, length, slack)
+    slack = problem.s.clipped(problem.s.values + limit * step.slack, _BENT_SLACK_FRACTION)
+    trial = problem.trial(step, limit, slack)
     within = trial.point.finite and trial.point.max_violation <= _MAX_BENT_VIOLATION
-    if not within or not _is_acceptable(pairs, start, length, trial):
+    if not within or not _is_acceptable(pairs, start, limit, trial):
         return None
     # The multipliers go the whole length, though some slacks stopped.
-    return AcceptedStep(step, trial, length, ["bent"])
-
-
-def _backtrack(
-    problem: BarrierProblem, pairs: Filter, step: Step, start: SearchStart, longest: float, residual: Vector
-) -> AcceptedStep | None:
-    """Halve the step length until the filter accepts the point; None below the least length."""
-    # Each halving costs an evaluation of f and g, no derivatives and no factorization.
-    length, trials = longest, 0
-    while True:
-        trials += 1
-        trial = problem.trial(step, length)
-        if _is_acceptable(pairs, start, length, trial):
-            return AcceptedStep(step, trial, length, [])
-        # only a first trial with more violation is corrected (step A-5.5): a shorter one is nearly linear
-        if trials == 1 and trial.theta >= start.theta and problem.options.second_order_correction:
-            accepted = _second_order_correction(problem, pairs, start, residual, trial, longest)
-            if accepted is not None:
-                return accepted
-        length *= 0.5
-        if length < pairs.min_length(start):
-            return None
-
-
-def _second_order_correction(
-    problem: BarrierProblem,
-    pairs: Filter,
-    start: SearchStart,
-    residual: Vector,
-    trial: Trial,
-    longest: float,
-) -> AcceptedStep | None:
-    """Steps for the residual that a refused trial point leaves, while they reduce it (section 2.4)."""
-    # p and n take up what the linearization misses (`Elastic.move`).
-    if problem.elastic is not None:
-        return None
-    corrected_residual, theta = residual, trial.theta
-    for k in range(_MAX_CORRECTIONS):
-        if not trial.point.finite:
-            break
-        # c_soc = alpha c(x) + c(x + alpha d) (section 2.4): the same matrix, another right-hand side. The
-        # paper has the alpha of the correction before (A-5.9), ours that of the first trial; on 60 random
-        # programs of four variables the one took 867 iterations, the other 856.
-        corrected_residual = longest * corrected_residual + problem.residual(trial.point, trial.slack)
-        step = problem.step_for(corrected_residual)
-        trial = problem.trial(step, problem.max_length(step))
-        # As for a first trial: by its length, from the same start (A-5.7).
-        if _is_acceptable(pairs, start, longest, trial):
-            return AcceptedStep(step, trial, longest, [f"{k + 1} corrections"])
-        if trial.theta > _KAPPA_SOC * theta:
-            break
-        theta = trial.theta
-    return None
+    return AcceptedStep(step, trial, limit, ["bent"])
 
 
 def _is_acceptable(pairs: Filter, start: SearchStart, length: float, trial: Trial) -> bool:
@@ -324,7 +327,8 @@ def solve_ipm(
     Parameters
     ----------
     program : the program; its constraints and variables should be of order one.
-    x0 : initial guess (n,); moved into the variables' bounds, where every iterate stays.
+    x0 : initial guess (n,); moved into the variables' bounds, where every iterate stays, but for variables
+        that equalities determine: their bounds are constraints.
     options : see `IPMOptions`.
     callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
     multipliers, bound_multipliers : initial guess of the multipliers (m,), (n,), from a similar program.
@@ -431,15 +435,12 @@ class InteriorRun(Run[IPMOptions]):
             # Before the test of convergence: a solution without these constraints is none.
             if self._lacks_constraints():
                 return Status.ACCEPTABLE
-            if error <= self.options.kkt_tolerance or phase.is_restored(problem):
-                status = phase.conclude(problem)
+            solved = error <= self.options.kkt_tolerance or phase.is_restored(problem)
+            if solved or phase.is_met_for_long(problem):
+                status = phase.conclude(problem) if solved else phase.change_aim(problem, met=True)
                 if status is not None:
                     return status
                 # The same point is recorded once more, under its new aim.
-                self._search.reset_filter()
-                continue
-            if phase.is_met_for_long(problem):
-                phase.change_aim(problem, met=True)
                 self._search.reset_filter()
                 continue
             if self._out_of_time():

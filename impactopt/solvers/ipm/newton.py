@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -204,7 +205,7 @@ class BlockCholesky:
     def solve(self, right: Vector) -> Vector:
         """K^-1 times a vector (n,) or columns (n, k)."""
         # BLAS takes columns; a vector is one.
-        x = np.asfortranarray(right[self._order].reshape(self._n, -1))
+        x = np.asfortranarray(right[self._order].reshape(self._n, math.prod(right.shape[1:])))
         x = self._kernels.solve(self._panels, self._values, x)
         out = np.empty(x.shape)
         out[self._order] = x
@@ -286,9 +287,12 @@ class NewtonSystem:
 
         Returns
         -------
-        False if no shift suffices, or eliminated constraints do not determine their variables.
+        False if no shift suffices, or eliminated constraints do not determine their variables, or values are
+        not finite.
         """
         c = self.condenser
+        if not (np.isfinite(jacobian.data).all() and np.isfinite(hessian.data).all()):
+            return False  # BLAS's Cholesky factorization may take nan for positive
         try:
             c.load(jacobian, hessian)
         except np.linalg.LinAlgError:
@@ -451,16 +455,19 @@ def acquire(
     determined : variables that constraints determine.  equal (m,) : which constraints are equalities.
     bounded, moves (n,) : which variables have a finite bound, and which are not fixed.
     """
+    # A fixed variable follows from nothing but its bounds.
+    determined = [Determined(*one) for one in determined if moves[one[1]].all()]
     # The key has two parts. Programs with the same first part have the same equalities, bounds and variables:
     # their systems differ in inequalities at most, and can be adapted.
     mine = equal[jacobian.indices]
     starts = np.append(0, np.cumsum(mine))[jacobian.indptr]
     of_equalities = np.cumsum(equal)[jacobian.indices[mine]], starts
-    variables = [variables for _, variables in determined]
-    structure = _digest([rank for rank, _ in determined], *of_equalities, *variables, bounded, moves)
+    sizes = [(one.rank, one.variables.size) for one in determined]
+    variables = np.concatenate([np.zeros(0, np.intp), *[one.variables for one in determined]])
+    structure = _digest(sizes, *of_equalities, variables, bounded, moves)
     patterns = [a for matrix in (jacobian, hessian) for a in (matrix.indptr, matrix.indices)]
     key = structure + _digest(None, *patterns, equal)
-    # Taken out of the cache while it is in use: it has state, and solves may be nested.
+    # Taken out of the cache while it is in use: it has state, and solves may be nested, or run in threads.
     system = _systems.pop(key, None) or _adapted(structure, jacobian, hessian, equal)
     if system is None:
         kernels = fastest_kernels()
@@ -474,14 +481,20 @@ def acquire(
 
 def _adapted(structure: bytes, jacobian: Matrix, hessian: Matrix, equal: Mask) -> NewtonSystem | None:
     """Cached system with the same equalities, adapted to these inequalities; None if there is none."""
-    for key, system in reversed(_systems.items()):
-        if key.startswith(structure) and system.condenser.adapt(jacobian, hessian, equal):
-            return _systems.pop(key)
+    for key in [key for key in list(_systems)[::-1] if key.startswith(structure)]:
+        # Taken out first: another thread must not use it meanwhile, nor a later solve if Ctrl-C leaves it
+        # half adapted.
+        system = _systems.pop(key, None)
+        if system is None:
+            continue
+        if system.condenser.adapt(jacobian, hessian, equal):
+            return system
+        release(system)
     return None
 
 
-def _digest(ranks: Any, *arrays: Index | Mask) -> bytes:
-    digest = hashlib.sha256(repr(ranks).encode())
+def _digest(more: Any, *arrays: Index | Mask) -> bytes:
+    digest = hashlib.sha256(repr(more).encode())
     for array in arrays:
         digest.update(f"{array.dtype} {array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -367,9 +367,9 @@ EXPORT int newton_cholesky(panels *p, double *values) {
     return 0;
 }
 
-/* Replace x (n, columns) by K^-1 x. p->work: height times columns. */
-EXPORT void newton_solve(panels *p, double *values, double *x, int64_t n, int64_t columns) {
-    int nx = n, nrhs = columns;
+/* Replace x (n, nrhs) by K^-1 x, for nrhs <= n: p->work has room for so many columns. */
+static void solve(panels *p, double *values, double *x, int64_t n, int nrhs) {
+    int nx = n;
     for (int64_t k = 0; k < p->count; ++k) {
         int own = p->size[k], h = p->height[k], rest = h - own;
         double *panel = values + p->at[k], *mine = x + p->start[k];
@@ -392,5 +392,13 @@ EXPORT void newton_solve(panels *p, double *values, double *x, int64_t n, int64_
             gemm("T", "N", &own, &nrhs, &rest, &minus, panel + own, &h, p->work, &rest, &one, mine, &nx);
         }
         trsm("L", "L", "T", "N", &own, &nrhs, &one, panel, &h, mine, &nx);
+    }
+}
+
+/* The same for any number of columns: there may be more of them than variables, if equalities depend on each other. */
+EXPORT void newton_solve(panels *p, double *values, double *x, int64_t n, int64_t columns) {
+    for (int64_t first = 0, count; n && first < columns; first += count) {
+        count = columns - first < n ? columns - first : n;
+        solve(p, values, x + first * n, n, count);
     }
 }

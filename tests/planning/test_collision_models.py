@@ -15,6 +15,7 @@ from support.small_plans import arm_problem, biped_problem, struck, transcribed
 from typer.testing import CliRunner
 
 from impactopt import (
+    ContactFriction,
     FreeMass,
     HertzDamped,
     HuntCrossley,
@@ -24,6 +25,7 @@ from impactopt import (
     RigidWall,
     Scenario,
     SpringDamper,
+    Status,
     coasting_reference,
     load_problem,
     optimize_strike,
@@ -241,6 +243,15 @@ def test_a_warm_start_of_another_model_has_a_contact(
     assert np.trapezoid(contact.force, contact.time) == pytest.approx(new.impulse(x), rel=0.1)
     assert target.mass * contact.outcome["speed_m_s"] == pytest.approx(new.impulse(x), rel=1e-3)
     assert new.impulse(x) > 0.1
+
+
+def test_a_solution_with_friction_starts_one_without() -> None:
+    friction = ContactFriction(coefficient=0.3, stiffness=1e5)  # bristles are variables of the program
+    problem = dataclasses.replace(arm_problem(), friction=friction)
+    given = solve(problem, refine=False)
+    found = solve(dataclasses.replace(problem, friction=None), start=given, refine=False)
+    assert found.status is Status.SOLVED
+    assert found.impulse == pytest.approx(given.impulse, rel=0.1)
 
 
 def test_auto_skips_what_cannot_do() -> None:

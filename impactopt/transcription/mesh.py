@@ -151,7 +151,6 @@ class CollocationPoint:
     """
 
     phase: int
-    phase_name: str
     name: str
     place: float  # s in the phase
     weights: Array  # (stages,)
@@ -182,7 +181,6 @@ def collision_mesh(
                 stages.append(
                     CollocationPoint(
                         phase,
-                        name,
                         f"{name}, {percentage(s + c * h, digits, 'g')}",
                         s + c * h,
                         inverse[i] / h,

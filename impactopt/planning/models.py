@@ -54,11 +54,13 @@ _TEST_FRACTION, _TEST_SPEED = 0.5, 1.0
 def carried_start(
     t: ContactProgram, old: Callable[[], ContactProgram], start: Solved, constraints: Any
 ) -> SolverResult:
-    """Solution mapped to the warm start of a program with another collision model, lazy constraints or gains.
+    """Solution mapped to a program with another collision model, friction, lazy constraints or gains.
 
     old : makes the solution's program.  constraints : clearance constraints of the new one.
     """
-    before, now = ((p.collision, p.freezes, lazy_terms_of(p), p.gains) for p in (start.problem, t.problem))
+    before, now = (
+        (p.collision, p.freezes, p.friction, lazy_terms_of(p), p.gains) for p in (start.problem, t.problem)
+    )
     # Same variables and constraints: the result fits as it is.
     if before == now:
         return start.result

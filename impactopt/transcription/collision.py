@@ -479,10 +479,9 @@ class Collision(ContactParameters):
         return group[i], slope + before * s.start
 
     def _place(self, s: CollocationPoint) -> Place:
-        time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
         # a scenario's name may have braces, and the text is a format for the time
         suffix = self.suffix.replace("{", "{{").replace("}", "}}")
-        return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
+        return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", self._time(s.phase, s.place))
 
     def _travel(self, i: int) -> list[Affine]:
         """Slots d1, T1, d, T of y = y0 + T1 d1 + T d at a stage."""
@@ -724,7 +723,7 @@ class Collision(ContactParameters):
         before = np.concatenate([[0.0], np.cumsum(times)])
         # d and xt are integrals over s: by the duration of the guess, not the clipped one, so that d is the
         # integral of u ds
-        per_time = (1 / found.durations[phase])[:, None]  # d and xt are integrals over s
+        per_time = (1 / found.durations[phase])[:, None]
         d = found.moved[:, None] * per_time * rates
         self.u.write(x, found.speed[:, None] * rates)
         self.d.write(x, d)

@@ -72,6 +72,7 @@ class ContactProgram(ABC):
 
     Attributes
     ----------
+    program : for a solver.
     builder : variables, blocks and constraints of all parts.
     hit : collisions with all targets.
     problem, coordinates, robot, functions, y0, legs0 : the builder's.
@@ -80,6 +81,8 @@ class ContactProgram(ABC):
     clearance_constraints : clearance constraints, in the program's order; they are its last constraints.
     postures : of `strongest_posture` that are known, by seed; copies of the program share them.
     """
+
+    program: StructuredProgram
 
     def __init__(self, builder: Builder, hit: ContactSet) -> None:
         self.builder, self.hit = builder, hit
@@ -230,10 +233,9 @@ class ContactProgram(ABC):
         self._objective = assemble(self.layout, self.objectives, self._prices())
         # each round's set of clearance constraints is added to a copy of this builder
         self._without_clearance = self.builder
+        self.program = self._assembled()
 
-    @cached_property
-    def program(self) -> StructuredProgram:
-        """The program for a solver."""
+    def _assembled(self) -> StructuredProgram:
         objective, quadratic, linear = self._objective
         # one structure for all sets of clearance constraints, which solvers can reuse
         if self.clearance_constraints:
@@ -253,11 +255,10 @@ class ContactProgram(ABC):
     def with_clearance(self: Program, constraints: Mapping[ClearanceKey, SeparatingDirection]) -> Program:
         """The same program with exactly these clearance constraints."""
         other = copy.copy(self)
-        # the copy has the cached program of the old constraints
-        other.__dict__.pop("program", None)
         other.builder = self._without_clearance.copy()
         order = add_clearance_constraints(other.builder, self.body_spots, constraints)
         other.clearance_constraints = {key: constraints[key] for key in order}
+        other.program = other._assembled()
         return other
 
     @cached_property

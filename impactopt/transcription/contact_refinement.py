@@ -173,8 +173,11 @@ class _FinerContact:
             new_group.write(z, old_group.read(x))
             fixed.append(new_group.index(0))
         for new, old in zip(self.hit.lasting, self._planned.lasting, strict=True):
-            map_contact(new, old, z, x)
-            # positions after contact follow from the solution
+            map_stages(new, old, z, x)
+            for new_group, old_group in zip(new.kept_groups(), old.kept_groups(), strict=True):
+                new_group.write(z, old_group.read(x))
+            # positions after contact follow from the solution, and what is zero by its bounds is not
+            # determined
             fixed += [new.after.index(0)] if new.after.count else []
             fixed.append(np.setdiff1d(new.zeros(), [] if self._apart else new.f.index(-1)))
         ends = {phase.end for phase in self._builder.problem.contact_phases}
@@ -299,29 +302,30 @@ def _impulse_error(new: Collision, old: Collision, z: Array, x: Array) -> float:
     return _scale(old, x) * (float(new.p.read(z)[-1, 0] - old.p.read(x)[-1, 0]) + rest)
 
 
-def map_contact(new: Collision, old: Collision, into: Array, x: Array) -> None:
-    """Map a collision to shorter elements: sample its collocation polynomials at their stages.
+def map_stages(new: Collision, old: Collision, into: Array, x: Array) -> None:
+    """Map a collision to other elements: sample its collocation polynomials at their stages.
+
+    Variables that the old collision's model has not are left as they are.
 
     into : solver variables of the new collision's program, which are written.  x : of the old one's.
     """
-    start = {"u": old.contact.u0.read(x), "state": np.zeros((1, old.state.size))}
-    start |= {name: np.zeros((1, getattr(old, name).size)) for name in ("bristles", "tangential")}
-    start |= {name: np.zeros((1, 1)) for name in ("xt", "p")}
-    for name, at_contact in start.items():
-        weights = _weights(new.stages, old.stages, each_phase=name == "xt")
-        values = np.vstack([getattr(old, name).read(x), at_contact])
-        getattr(new, name).write(into, weights @ values)
+    for name in ("u", "state", "xt", "p", "bristles", "tangential"):
+        group, old_group = getattr(new, name), getattr(old, name)
+        if group.size == old_group.size:
+            at_contact = old.contact.u0.read(x) if name == "u" else np.zeros((1, group.size))
+            weights = _weights(new.stages, old.stages, each_phase=name == "xt")
+            group.write(into, weights @ np.vstack([old_group.read(x), at_contact]))
     weights = _weights(new.stages, old.stages, known=False)[:, :-1]
-    for new_group, old_group in zip(new.groups_without_start(), old.groups_without_start(), strict=True):
-        new_group.write(into, weights @ old_group.read(x))
+    known = {group.name: group for group in old.groups_without_start()}
+    for group in new.groups_without_start():
+        if group.name in known:
+            group.write(into, weights @ known[group.name].read(x))
     for integral, rate in new.integrated():
         u = rate.read(into)
         d = np.zeros_like(u)
         for i, s in enumerate(new.stages):  # by the constraints of integrals, which are linear
             d[i] = s.quadrature @ u[list(s.members)] + (0.0 if s.new_phase else d[s.previous])
         integral.write(into, d)
-    for new_group, old_group in zip(new.kept_groups(), old.kept_groups(), strict=True):
-        new_group.write(into, old_group.read(x))
     # bristles jump where they are released: there is no polynomial from a touch into a gap
     into[new.zeros()] = 0.0
 

@@ -21,7 +21,7 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves, speed_with_order
 from impactopt.transcription.contact_program import ContactProgram
-from impactopt.transcription.contact_refinement import map_contact, same_places
+from impactopt.transcription.contact_refinement import map_stages, same_places
 from impactopt.transcription.layout import Array, ConstraintOrigin, Group
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.motion_phase import MotionPhase
@@ -30,7 +30,7 @@ from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 
 # ends of names of variables whose meaning depends on the collision model: they are guessed anew for another
-MODEL_VARIABLES = ("coasting legs", "coasting leg rates")
+MODEL_VARIABLES = ("coasting legs", "coasting leg rates", "coasting leg accelerations")
 MAX_DURATION = 2.0  # [s] of a phase: in a slower swing the robot hardly moves at contact
 # Share of the least leg extension that a guess keeps: the solver corrects smaller violations in as few
 # iterations as without. And descents of the base [m] that are tried for it.
@@ -256,9 +256,10 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
 def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
     """Solution of an old program, mapped to one that differs: warm start of the solver.
 
-    The new program may have more nodes or collocation elements, another collision model with duration, or
-    first instants of contact. Variables at nodes are interpolated, and those of the contact sampled from its
-    polynomials. Multipliers are those of the same constraints and variables, else zero.
+    The new program may have more nodes or collocation elements, another collision model, or first instants of
+    contact. Variables at nodes are interpolated, and those of the contact sampled from its polynomials. The
+    contact with a duration is guessed anew from an impact without one, and conversely. Multipliers are those
+    of the same constraints and variables, else zero.
 
     x, y, z : solver variables (n,), multipliers of constraints (m,) and of bounds (n,) of the old program.
 
@@ -291,19 +292,22 @@ def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Ar
             pairs = [(int(i), k) for k, i in enumerate(np.flatnonzero(np.isin(now, before)))]
             group.write(new, np.column_stack([np.interp(now, before, column) for column in known.read(x).T]))
         elif known.count == len(old.hit.stages) and known.count != group.count:
-            pairs = stages  # `map_contact` writes the variables, below
+            pairs = stages  # `map_stages` writes the variables, below
         else:
             group.write(new, known.read(x))
         for i, k in pairs:
             bounds[group.index(i)] = z[known.index(k)]
     state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
     for collision, old_collision in zip(t.hit.collisions, old.hit.collisions, strict=True):
-        if not isinstance(collision, Collision) or not isinstance(old_collision, Collision):
+        lasts, lasted = (isinstance(each, Collision) for each in (collision, old_collision))
+        if lasts != lasted:
+            collision.guess(new, *state)
+        if not (lasts and lasted):
             continue
+        if t.hit.elements != old.hit.elements:
+            map_stages(collision, old_collision, new, x)
         if _model(t) != _model(old):
             collision.guess_model(new, *state)
-        elif t.hit.elements != old.hit.elements:
-            map_contact(collision, old_collision, new, x)
     if len(t.hit.first) != len(old.hit.first):
         for first in t.hit.first:
             first.guess(new, *state)

@@ -230,7 +230,14 @@ class Layout:
         scale: ArrayLike = 1.0,
         labels: Sequence[str] | None = None,
     ) -> Group:
-        """Append ``count`` vectors of ``size`` variables; bounds (physical) broadcast to (count, size)."""
+        """Append ``count`` vectors of ``size`` variables; bounds (physical) broadcast to (count, size).
+
+        Raises
+        ------
+        InputError : the name is taken.
+        """
+        if name in self.groups:
+            raise InputError(f"there are variables {name!r} already: give others a name of their own")
         s = np.broadcast_to(np.asarray(scale, dtype=float), (size,)).copy()
         tags = tuple(labels) if labels is not None else tuple(str(i) for i in range(size))
         group = Group(name, self.n, count, size, s, tags)

@@ -7,8 +7,9 @@ the ZMP can leave the soles between two nodes.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, count
 from typing import NamedTuple
 
 import numpy as np
@@ -150,7 +151,7 @@ class CollocationPoint:
     """
 
     phase: int
-    phase_name: str
+    name: str
     place: float  # s in the phase
     weights: Array  # (stages,)
     start: float
@@ -158,11 +159,6 @@ class CollocationPoint:
     previous: int  # index of the stage that the element starts from, -1 at contact
     quadrature: Array  # (stages,)
     new_phase: bool  # the element begins a phase, so d starts from zero
-
-    @property
-    def name(self) -> str:
-        # three digits: a short element has several points within one per cent
-        return f"{self.phase_name}, {100 * self.place:.3g} %"
 
 
 def collision_mesh(
@@ -173,15 +169,19 @@ def collision_mesh(
     inverse = np.linalg.inv(radau.a)
     stages: list[CollocationPoint] = []
     for phase, name in enumerate(names):
-        s = 0.0
-        for e, h in enumerate(elements[phase]):
+        begins = [0.0, *accumulate(elements[phase])]
+        # three digits: a short element has several points within one per cent
+        digits = digits_of(
+            (s + c * h for s, h in zip(begins, elements[phase], strict=False) for c in radau.c), 3, "g"
+        )
+        for e, (s, h) in enumerate(zip(begins, elements[phase], strict=False)):
             first = len(stages)
             members = tuple(range(first, first + len(radau.c)))
             for i, c in enumerate(radau.c):
                 stages.append(
                     CollocationPoint(
                         phase,
-                        name,
+                        f"{name}, {percentage(s + c * h, digits, 'g')}",
                         s + c * h,
                         inverse[i] / h,
                         -float(inverse[i].sum()) / h,
@@ -191,7 +191,6 @@ def collision_mesh(
                         e == 0,
                     )
                 )
-            s += h
     return stages
 
 
@@ -284,9 +283,15 @@ def contact_mesh(problem: ImpactProblem, elements: Elements | None = None) -> li
     return collision_mesh(elements or contact_elements(problem), radau, names)
 
 
-def percentage(s: float, more: Collection[float]) -> str:
-    """Name of a place on [0, 1]; with more digits for additional nodes, which have others near them."""
-    return f"{100 * s:.2f} %" if s in more else f"{100 * s:.0f} %"
+def percentage(s: float, digits: int, kind: str = "f") -> str:
+    """Name of a place on [0, 1].  digits : decimals, or with the kind "g" significant digits."""
+    return f"{100 * s:.{digits}{kind}} %"
+
+
+def digits_of(places: Iterable[float], least: int = 0, kind: str = "f") -> int:
+    """Number of digits, at least ``least``, with which the names of different places differ."""
+    different = {float(s) for s in places}
+    return next(d for d in count(least) if len({percentage(s, d, kind) for s in different}) == len(different))
 
 
 def with_middles(breaks: Array) -> Array:

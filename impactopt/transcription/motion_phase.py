@@ -36,7 +36,7 @@ from impactopt.transcription.layout import (
     percent,
     stack,
 )
-from impactopt.transcription.mesh import percentage, with_middles
+from impactopt.transcription.mesh import digits_of, percentage, with_middles
 
 
 def add_nodes(
@@ -204,6 +204,9 @@ class MotionPhase:
         self.phase, self.more = phase, more
         self.breaks = graded_breaks(phase.intervals, phase.grading, fine_end=fine_end)
         regular = with_middles(self.breaks)
+        # Messages, warm starts and clearance constraints know a node by its name. Additional nodes do not
+        # change those of others, so that a refined mesh has the same ones.
+        self._digits = digits_of(regular)
         # a start at rest has no node: the posture there is given
         self.nodes = np.union1d(regular[1:] if begins == REST else regular, more)
         self._begins, self._ends = begins, ends
@@ -284,7 +287,9 @@ class MotionPhase:
         return y, y1, y2 if self.bend is None else stack([self.bend[k], y2[6:]])
 
     def place_at(self, s: float) -> Place:
-        return Place(f"{self.name}, {percentage(s, self.more)}", f"{self.name} at {{s}}", self.T[0] * s)
+        # an additional node has others near it
+        name = percentage(s, self._digits + 2 * (s in self.more))
+        return Place(f"{self.name}, {name}", f"{self.name} at {{s}}", self.T[0] * s)
 
     def instances(self) -> tuple[list[list[Affine]], list[Place]]:
         """Slots of the block ``node`` at each node, and the nodes' places."""

@@ -35,7 +35,9 @@ from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
-LOAD_STEP, CONTACT_STEP = 5e-3, 1e-3  # [s] of the coarse reference, and of all references in contact, at most
+# [s] Steps of the coarse reference, from which loads are taken, and of all references in contact, at most.
+# Loads change no faster than the nodes are apart, and inverse dynamics of every millisecond is slow.
+LOAD_STEP, CONTACT_STEP = 5e-3, 1e-3
 MOMENT_COST = 10.0  # [1/m] weight of a wrench correction's moments relative to its forces
 
 
@@ -827,10 +829,6 @@ class Plan:
             "sole_cop_margin_asked_mm": {n: 1e3 * m for n, m in required.items() if m is not None},
             "sole_force_asked_N": cone.minimum_force,
         }
-
-
-# [s] Sampling of motions for loads. These change no faster than the nodes are apart, and inverse kinematics
-# and dynamics of every millisecond would be slow.
 
 
 def motion_loads(robot: Robot, reference: Trajectory, hit: PlannedCollision) -> DriveLoads:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.small_plans import arm_problem, biped_problem, struck
+from support.small_plans import arm_problem, biped_problem, struck, transcribed
 from typer.testing import CliRunner
 
 from impactopt import (
+    ContactFriction,
     FreeMass,
     HertzDamped,
     HuntCrossley,
@@ -23,6 +25,7 @@ from impactopt import (
     RigidWall,
     Scenario,
     SpringDamper,
+    Status,
     coasting_reference,
     load_problem,
     optimize_strike,
@@ -36,7 +39,7 @@ from impactopt.planning.models import climbed, good_enough
 from impactopt.planning.solution import ModelError
 from impactopt.problem.problem import COLLISIONS
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.transcription.initial_guess import strike_iterate, warm_start
+from impactopt.transcription.initial_guess import first_iterate, strike_iterate, warm_start
 from impactopt.transcription.mesh import contact_elements, guessed_shares, place_of
 from impactopt.transcription.plan import PlannedStrike
 from impactopt.transcription.strike import StrikeTranscription
@@ -215,6 +218,40 @@ def test_compiling_the_first_model_takes_no_time_from_the_second(monkeypatch: py
     budget = Budget(solver="ipm", options=None, time_limit=0.03, callback=None)
     assert climbed(problem, run, budget).build_seconds == pytest.approx(0.08)
     assert given == [pytest.approx(0.03), pytest.approx(0.02)]
+
+
+@pytest.mark.parametrize(
+    ("make", "before", "after"),
+    [
+        (arm_problem, {"collision": "virtual-mass"}, {"collision": "sdc"}),
+        (arm_problem, {"collision": "rigid"}, {"collision": "full"}),
+        (arm_problem, {"collision": "sdc", "freezes": 2}, {"collision": "sdc", "freezes": 5}),
+        (arm_problem, {"collision": "full"}, {"collision": "sdc", "freezes": 5}),
+        (biped_problem, {"collision": "sdc", "freezes": 3}, {"collision": "sdc", "freezes": 2}),
+    ],
+    ids=str,
+)
+def test_a_warm_start_of_another_model_has_a_contact(
+    make: Callable[[], ImpactProblem], before: dict[str, Any], after: dict[str, Any]
+) -> None:
+    target = FreeMass(mass=3.0)
+    problem = dataclasses.replace(make(), law=SpringDamper(stiffness=1e5, damping=50.0), target=target)
+    old, new = (transcribed(dataclasses.replace(problem, **each)) for each in (before, after))
+    x, *_ = warm_start(new, old, first_iterate(old), np.zeros(old.program.m), np.zeros(old.program.n))
+    contact = new.decode(x).collision
+    # the force's integral is the impulse, and what the target gains
+    assert np.trapezoid(contact.force, contact.time) == pytest.approx(new.impulse(x), rel=0.1)
+    assert target.mass * contact.outcome["speed_m_s"] == pytest.approx(new.impulse(x), rel=1e-3)
+    assert new.impulse(x) > 0.1
+
+
+def test_a_solution_with_friction_starts_one_without() -> None:
+    friction = ContactFriction(coefficient=0.3, stiffness=1e5)  # bristles are variables of the program
+    problem = dataclasses.replace(arm_problem(), friction=friction)
+    given = solve(problem, refine=False)
+    found = solve(dataclasses.replace(problem, friction=None), start=given, refine=False)
+    assert found.status is Status.SOLVED
+    assert found.impulse == pytest.approx(given.impulse, rel=0.1)
 
 
 def test_auto_skips_what_cannot_do() -> None:

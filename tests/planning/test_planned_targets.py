@@ -287,7 +287,7 @@ def test_plans_of_an_arm_drive_nails_and_break_boards() -> None:
         plan = solved(dataclasses.replace(arm_problem(), robot=robot, law=law, target=target))
         assert plan.impulse > 0.5
         assert next(iter(plan.collision.outcome.values())) > 3e-3
-        assert contact_mesh(plan.problem)[-1].phase_name == target.phases[-1]
+        assert contact_mesh(plan.problem)[-1].name == f"{target.phases[-1]}, 100 %"
 
 
 # ---- what is refused

@@ -141,6 +141,16 @@ def test_a_block_may_be_named_as_a_function_of_c(arm_transcription: Transcriptio
     assert "floor_hess" in block_functions(problem, problem.coordinates)
 
 
+def test_variables_with_a_name_that_is_taken_are_refused(arm_transcription: Transcription) -> None:
+    class Taken(Pushes):
+        def quantity(self, program: Any) -> Any:
+            program.layout.add("swing duration", 1, 1)
+            return super().quantity(program)
+
+    with pytest.raises(InputError, match="there are variables 'swing duration' already"):
+        changed(arm_transcription, objectives=(Impulse(), Taken(weight=1.0)))
+
+
 def test_an_objective_of_ones_own_is_kept_small(arm_transcription: Transcription) -> None:
     objectives = (Impulse(), Strain(weight=10.0))
     t = changed(arm_transcription, objectives=objectives)

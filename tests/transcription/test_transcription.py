@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 from support.derivative_checks import check_derivatives
 from support.small_plans import LAW, Planned, changed
 
-from impactopt import ContactWrenchCone, Incidence, Phase, Scenario, Status, TorqueLimit, VelocityLimit
+from impactopt import (
+    ContactWrenchCone,
+    Incidence,
+    MotorCurve,
+    Phase,
+    Scenario,
+    Status,
+    TorqueLimit,
+    TorqueRate,
+    VelocityLimit,
+)
 from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.support import contact_wrench_cone, zmp
 from impactopt.solvers.ipopt import solve_ipopt
@@ -95,6 +105,22 @@ def test_every_constraint_and_every_variable_has_a_unique_name(transcription: Tr
         names = [name(i) for i in range(count)]
         assert all(names)
         assert len(set(names)) == count
+
+
+def test_names_on_a_fine_mesh_differ_too(arm_transcription: Transcription) -> None:
+    # intervals and elements of less than one per cent, and torques that are variables of each node and stage
+    fine = (0.95, *[0.001] * 50)
+    t = changed(
+        arm_transcription,
+        swing=Phase(duration=0.4, intervals=60),
+        collision_elements=(fine, fine),
+        terms=(TorqueRate(limit=1e6), MotorCurve()),
+    )
+    program = t.program
+    for count, name in ((program.m, program.constraint_name), (program.n, program.variable_name)):
+        assert len({name(i) for i in range(count)}) == count
+    # nodes, by whose names clearance constraints and warm starts find them
+    assert len({place.name for place, _ in t.body_spots}) == len(t.body_spots)
 
 
 def test_names_say_what_where_and_which(biped_transcription: Transcription) -> None:

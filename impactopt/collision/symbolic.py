@@ -83,7 +83,8 @@ class SymbolicModel(SteppedModel):
         tangents with respect to q, v and feedforward. All other derivatives are differences of two collisions
         with tight steps for each number of the input: those with respect to settings; those of models with
         further freezes or with "rk4", which is the method of all with friction at the striking point; and
-        those of configuration, velocity and the target's results. The quaternion in q is normalized, so derivatives along its length are zero.
+        those of configuration, velocity and the target's results. The quaternion in q is normalized, so
+        derivatives along its length are zero.
 
         Parameters
         ----------

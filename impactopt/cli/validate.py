@@ -133,12 +133,20 @@ def validate(
         if as_json:
             print_json(done.report, ok)
         else:
-            from impactopt.report.console import output, reason_message, replay_table, say, touch_message
+            from impactopt.report.console import (
+                output,
+                reason_message,
+                replay_table,
+                replayed_touches_message,
+                say,
+                touch_message,
+            )
 
             console, summary = output(), planned.record.summary
             console.print(replay_table(done.report, summary))
             hit = world.missing or done.report["impulse_error_pct"] is not None
             say(console, reason_message(summary), "" if hit else "the target is not hit")
-            say(console, done.record.summary.get("gear_caution"), touch_message(done.report), *written)
+            caution = done.record.summary.get("gear_caution")
+            say(console, replayed_touches_message(done.report), caution, touch_message(done.report), *written)
         if not ok:
             raise typer.Exit(FELL)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from impactopt.errors import InputError, NotSolvedWarning, missing_package
+from impactopt.errors import InputError, NotSolvedWarning, missing_package, shortened
 from impactopt.files.problem_file import read_problem_file
 from impactopt.planning import nail_driving, replanning, solution, strike
 from impactopt.planning import solve as planning
@@ -205,7 +205,7 @@ def _or_file(run: Callable[..., R]) -> Callable[..., R]:
             return _public(run(problem, *args, **options))
         if not isinstance(problem, (str, os.PathLike)):
             raise InputError(
-                f"problem: a {type(problem).__name__} is none; give an ImpactProblem, the path of a problem "
+                f"problem: {shortened(repr(problem))} is none; give an ImpactProblem, the path of a problem "
                 "file, or the name of one that comes with the package (`impactopt problems`)"
             )
         read = read_problem_file(problem)

@@ -113,7 +113,7 @@ def solve(
     with plain_errors(interrupted, verbose=verbose, keeps=True, as_json=as_json) as console:
         from impactopt.cli.replays import compared_record
         from impactopt.errors import printable
-        from impactopt.files.output import keep_record, make_directory, set_aside
+        from impactopt.files.output import check_directory, keep_record, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.solution_library import SolvedFolder
         from impactopt.planning.solve import solve as plan
@@ -124,7 +124,7 @@ def solve(
         with SolveConsole(console, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
-            directory = make_directory(out if out is not None else Path("results") / file.stem)
+            directory = check_directory(out if out is not None else Path("results") / file.stem)
             progress.say("building the nonlinear program (compiles for some ten seconds the first time)")
             processes = workers if starts > 1 else 1
             chosen |= {"start": start, "starts": starts, "workers": processes, "seed": seed}
@@ -132,7 +132,7 @@ def solve(
             if store is None:
                 solution = plan(problem, **chosen)
             else:
-                kept = SolvedFolder(make_directory(store))
+                kept = SolvedFolder(check_directory(store))
                 solution, near = kept.solve(problem, read, **chosen)
                 kept.keep(solution, read)
                 progress.say(f"warm start from {near}" if near else f"no plan in {store} is near enough")

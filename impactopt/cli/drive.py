@@ -29,14 +29,14 @@ def drive(
     is in, 1 it is not, 2 bad input.
     """
     with plain_errors("interrupted before the nail was in", verbose=verbose, as_json=as_json) as console:
-        from impactopt.files.output import keep_series, make_directory, set_aside
+        from impactopt.files.output import check_directory, keep_series, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.record import plain
         from impactopt.planning.nail_driving import drive_nail
         from impactopt.report.console import SolveConsole, nail_driving_table, output
 
         read = read_problem_file(problem, parse_settings(settings or ()))
-        directory = None if out is None else make_directory(out)
+        directory = None if out is None else check_directory(out)
         with SolveConsole(console, quiet=quiet) as progress:
             series = drive_nail(
                 read.build(), depth=depth, most=most, report=progress.say, **read.solver.arguments()

@@ -220,9 +220,10 @@ def robots(as_json: AsJson = False) -> None:
                 rows.append(_robot(name))
             except InputError as error:
                 rows.append({"name": name, "error": str(error)})
+        ok = not any("error" in row for row in rows)
         if as_json:
-            print_json({"robots": rows}, True)
-            return
+            print_json({"robots": rows}, ok)
+            raise typer.Exit(0 if ok else BAD_INPUT)
         for row in rows:
             if "error" in row:
                 typer.echo(f"{row['name']}: {row['error']}")
@@ -231,6 +232,8 @@ def robots(as_json: AsJson = False) -> None:
             for kind in ("strikers", "soles", "postures"):
                 if row[kind]:
                     typer.echo(f"  {kind:<9} {', '.join(row[kind])}")
+        if not ok:
+            raise typer.Exit(BAD_INPUT)
 
 
 def _robot(name: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import re
 import shlex
 import warnings
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+
+from impactopt.errors import did_you_mean
 
 NOT_SOLVED = 1  # exit code
 
@@ -150,6 +153,17 @@ class _Plain:
 
 class PlainCommand(_Plain, TyperCommand):
     """Command whose help shows flags without a type; it is quiet or verbose, not both."""
+
+    def parse_args(self, context: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(context, args)
+        except typer.BadParameter as error:
+            # of typer: 'x' is not one of 'a', 'b'.
+            given, one_of, choices = error.message.removeprefix("Value error, ").partition(" is not one of ")
+            if one_of:
+                near = did_you_mean(given.strip("'"), re.findall("'(.*?)'", choices))
+                error.message = f"{given}{one_of}{choices.rstrip('.')}{near}"
+            raise
 
     def invoke(self, context: Any) -> Any:
         if context.params.get("quiet") and context.params.get("verbose"):

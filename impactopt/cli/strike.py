@@ -48,7 +48,7 @@ def strike(
         "interrupted before there was a strike to keep", verbose=verbose, as_json=as_json
     ) as console:
         from impactopt.errors import printable
-        from impactopt.files.output import keep_record, make_directory, record_of_strike, set_aside
+        from impactopt.files.output import check_directory, keep_record, record_of_strike, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.planning.strike import optimize_strike
         from impactopt.report.console import SolveConsole
@@ -58,7 +58,7 @@ def strike(
         with SolveConsole(console, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
-            directory = None if out is None else make_directory(out)
+            directory = None if out is None else check_directory(out)
             progress.say("building the nonlinear program (compiles for some ten seconds the first time)")
             solution = optimize_strike(
                 problem,

@@ -89,7 +89,13 @@ def validate(
     Exit code: 0 stands (or the engine fixes the soles), 1 fell, 2 bad input.
     """
     with plain_errors("interrupted before the replay was done", verbose=verbose, as_json=as_json) as stderr:
-        from impactopt.files.output import check_ending, make_directory, remove_file, write_file
+        from impactopt.files.output import (
+            check_directory,
+            check_ending,
+            make_directory,
+            remove_file,
+            write_file,
+        )
         from impactopt.files.problem_file import parse_settings
         from impactopt.files.replay import load_planned, replay
         from impactopt.report.console import SolveConsole
@@ -97,10 +103,10 @@ def validate(
 
         # an option for each of its fields
         world = Perturbation(**{field.name: context.params[field.name] for field in fields(Perturbation)})
-        directory = None if out is None else make_directory(out)
+        directory = None if out is None else check_directory(out)
         if animation is not None:
             check_ending("an animation is a GIF", animation, ".gif")
-            make_directory(animation.parent)
+            check_directory(animation.parent)
         options = {name: value for name, value in (("step", step), ("settle", settle)) if value is not None}
         changes, written = parse_settings(settings or ()), []
         with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
@@ -114,7 +120,7 @@ def validate(
                 from impactopt.report.pictures import save_pictures
 
                 text = f"{json.dumps({'ok': ok, **done.report}, indent=2)}\n".encode()
-                written.append(directory / "replay.json")
+                written.append(make_directory(directory) / "replay.json")
                 old_picture = directory / "replay.png"  # of an earlier replay
                 write_file(written[0], lambda file: file.write(text), before=lambda: remove_file(old_picture))
                 written += save_pictures(done.record, directory, ["replay"])
@@ -122,16 +128,25 @@ def validate(
                 progress.say("drawing the motion")
                 from impactopt.report.pictures.animation import save_animation
 
+                make_directory(animation.parent)
                 written.append(save_animation(done, animation))
         if as_json:
             print_json(done.report, ok)
         else:
-            from impactopt.report.console import output, reason_message, replay_table, say, touch_message
+            from impactopt.report.console import (
+                output,
+                reason_message,
+                replay_table,
+                replayed_touches_message,
+                say,
+                touch_message,
+            )
 
             console, summary = output(), planned.record.summary
             console.print(replay_table(done.report, summary))
             hit = world.missing or done.report["impulse_error_pct"] is not None
             say(console, reason_message(summary), "" if hit else "the target is not hit")
-            say(console, done.record.summary.get("gear_caution"), touch_message(done.report), *written)
+            caution = done.record.summary.get("gear_caution")
+            say(console, replayed_touches_message(done.report), caution, touch_message(done.report), *written)
         if not ok:
             raise typer.Exit(FELL)

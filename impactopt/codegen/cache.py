@@ -22,6 +22,7 @@ import enum
 import functools
 import hashlib
 import json
+import logging
 import os
 import tempfile
 import time
@@ -125,6 +126,7 @@ def canonical(item: Any) -> str:
     )
 
 
+_log = logging.getLogger("impactopt")
 Report = Callable[[str], None]
 
 # Rooms whose sources can shape a graph: a change in one of them builds all functions anew, elsewhere none.
@@ -166,7 +168,8 @@ def cached_groups(groups: Sequence[FunctionGroup], *, report: Report | None = No
 
     While one group is compiled the next is built.
 
-    report : called with a line of text for each step, while functions are compiled.
+    report : called with a line of text for each step, while functions are compiled; None: the logger
+        "impactopt", with level INFO.
 
     Returns
     -------
@@ -174,7 +177,7 @@ def cached_groups(groups: Sequence[FunctionGroup], *, report: Report | None = No
     compiler, or with IMPACTOPT_NO_COMPILER=1 in the environment, they run in CasADi's virtual machine and a
     NoCompilerWarning says so once a process.
     """
-    report = report if report is not None else _ignore
+    report = _log.info if report is None else report
     compiler = find_compiler()
     if compiler is None:
         _warn_no_compiler()
@@ -373,7 +376,3 @@ def _sources_key() -> str:
 def _entry_key(name: str, recipe: tuple[Any, ...], compiler: Compiler) -> str:
     text = "\0".join([name, canonical(recipe), str(MAX_OPTIMIZED), _sources_key(), compiler.key])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
-def _ignore(message: str) -> None:
-    pass

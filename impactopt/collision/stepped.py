@@ -161,7 +161,8 @@ class SteppedModel(CollisionModel):
         impulse is mostly as exact as that. Errors add up in long contacts in which a servo oscillates
         undamped or saturates repeatedly.
     contact_friction : of the striking point on the target. Only with "rk4", which is then the method (None).
-    report : called with a line of text while functions are compiled.
+    report : called with a line of text while functions are compiled; None: the lines go to the logger
+        "impactopt", with level INFO.
 
     Raises
     ------

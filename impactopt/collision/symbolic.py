@@ -78,12 +78,13 @@ class SymbolicModel(SteppedModel):
         whose initial guess may be such a contact needs `separated` among the outputs.
 
         CasADi can differentiate the function with respect to all inputs (jacobian, forward, reverse), and
-        twice by differences. The code for this is compiled when it is first evaluated. A single scalar output
-        has an adjoint. Scalars and histories have tangents with respect to q, v and feedforward. All other
-        derivatives are differences of two collisions with tight steps for each number of the input: those
-        with respect to settings; those of models with further freezes or with "rk4", which is the method
-        of all with friction at the striking point; and those of configuration, velocity and the target's
-        results. The quaternion in q is normalized, so derivatives along its length are zero.
+        twice by differences. The code for this is compiled when it is first evaluated, which takes some ten
+        seconds and is told by `report`. A single scalar output has an adjoint. Scalars and histories have
+        tangents with respect to q, v and feedforward. All other derivatives are differences of two collisions
+        with tight steps for each number of the input: those with respect to settings; those of models with
+        further freezes or with "rk4", which is the method of all with friction at the striking point; and
+        those of configuration, velocity and the target's results. The quaternion in q is normalized, so
+        derivatives along its length are zero.
 
         Parameters
         ----------

@@ -196,8 +196,23 @@ def _numbers(thing: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if isinstance(value, kinds)}
 
 
+def check_directory(directory: Path) -> Path:
+    """The directory, which need not exist: made before a solve, it would stay if there is no result.
+
+    Raises
+    ------
+    InputError : it could not be made, or is not writable.
+    """
+    existing = next(path for path in (directory.absolute(), *directory.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise InputError(f"cannot make the directory {directory}: {existing} is a file; give another one")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write into {existing}; give another directory")
+    return directory
+
+
 def make_directory(directory: str | os.PathLike[str]) -> Path:
-    """The directory, made if it does not exist; called before a solve, whose result it is for.
+    """The directory, made if it does not exist.
 
     Raises
     ------

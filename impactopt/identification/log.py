@@ -100,11 +100,9 @@ def read_log(
     file = Path(path)
     name = shortened(str(file))
     columns = _npz(file, name) if file.suffix == ".npz" else _csv(file, name)
-    for needed in (TIME, FORCE):
-        _column(columns, needed, name)
-    time, force = columns[TIME], columns[FORCE]
+    time, force = (_column(columns, needed, name) for needed in (TIME, FORCE))
     if SPEED in columns:
-        return ImpactLog(time=time, force=force, speed=columns[SPEED], name=name)
+        return ImpactLog(time=time, force=force, speed=_column(columns, SPEED, name), name=name)
     if robot is None:
         raise InputError(
             f"{name}: no column {SPEED}{did_you_mean(SPEED, columns)}; give it, or joint positions and the "
@@ -115,41 +113,53 @@ def read_log(
 
 
 # ---------------------------------------------------------------- files
-def _csv(file: Path, name: str) -> dict[str, Array]:
+# the error is of a column with a cell that is no number, and raised if the column is needed
+Columns = Mapping[str, Array | InputError]
+
+
+def _csv(file: Path, name: str) -> Columns:
     """Columns of a CSV file, by their headings."""
     try:
         with open(file, newline="", encoding="utf-8-sig") as text:
-            rows = [row for row in csv.reader(text) if row]
+            reader = csv.reader(text)
+            rows = [(reader.line_num, row) for row in reader if row]
     except OSError as error:
         raise InputError(f"{name}: cannot be read: {error.strerror or error}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{name}: no CSV file ({error}); give one, or an .npz file") from None
     if not rows:
         raise InputError(f"{name} is empty; give {TIME}, {FORCE}, {SPEED} as a header, and a row an instant")
-    header = [cell.strip() for cell in rows[0]]
+    header = [cell.strip() for cell in rows[0][1]]
+    if len(header) == 1 and (other := next((s for s in (";", "\t") if s in header[0]), "")):
+        raise InputError(
+            f"{name}: its cells are separated by {other!r}; separate them by commas, with decimal points"
+        )
     twice = [cell for cell in header if cell and header.count(cell) > 1]
     if twice:
         raise InputError(f"{name}: two columns are called {twice[0]!r}; rename one of them")
     if len(rows) < 2:
         raise InputError(f"{name} has a header and no rows; give a row for each instant")
-    for number, row in enumerate(rows[1:], 2):
+    for line, row in rows[1:]:
         if len(row) != len(header):
-            raise InputError(f"{name}, row {number}: {len(row)} cells under {len(header)} headings")
-    return {heading: _numbers([row[k] for row in rows[1:]]) for k, heading in enumerate(header) if heading}
+            raise InputError(f"{name}, line {line}: {len(row)} cells under {len(header)} headings")
+    cells = {
+        heading: [(line, row[k]) for line, row in rows[1:]] for k, heading in enumerate(header) if heading
+    }
+    return {heading: _numbers(column, f"{name}: {heading}") for heading, column in cells.items()}
 
 
-def _numbers(cells: list[str]) -> Array:
-    """Numbers of a column; other text becomes NaN, which is an error in required columns only."""
+def _numbers(cells: list[tuple[int, str]], where: str) -> Array | InputError:
+    """Numbers of a column's cells, which are given with their lines."""
     out = np.empty(len(cells))
-    for k, cell in enumerate(cells):
+    for k, (line, cell) in enumerate(cells):
         try:
             out[k] = float(cell)
         except ValueError:
-            out[k] = np.nan
+            return InputError(f"{where}: {shortened(repr(cell))} in line {line}; give a number")
     return out
 
 
-def _npz(file: Path, name: str) -> dict[str, Array]:
+def _npz(file: Path, name: str) -> Columns:
     """Arrays of an npz file, by name."""
     try:
         with np.load(read_archive(file, MAX_BYTES, MAX_ARRAYS), allow_pickle=False) as arrays:
@@ -161,19 +171,22 @@ def _npz(file: Path, name: str) -> dict[str, Array]:
     return found
 
 
-def _column(columns: Mapping[str, Array], key: str, name: str) -> Array:
+def _column(columns: Columns, key: str, name: str) -> Array:
     if key not in columns:
         raise InputError(f"{name}: no column {key}{did_you_mean(key, columns)}; it has {_listed(columns)}")
-    return columns[key]
+    found = columns[key]
+    if isinstance(found, InputError):
+        raise found
+    return found
 
 
-def _listed(columns: Mapping[str, Array]) -> str:
+def _listed(columns: Columns) -> str:
     return shortened(", ".join(columns), 200) or "none"
 
 
 # ---------------------------------------------------------------- joint positions
 def _hand(
-    columns: Mapping[str, Array], robot: Robot, striker: str, normal: ArrayLike | None, name: str
+    columns: Columns, robot: Robot, striker: str, normal: ArrayLike | None, name: str
 ) -> tuple[Array, Array]:
     """Travel (k,) [m] of the striking point along the normal, and effective mass (k,) [kg] there."""
     if robot.floating:
@@ -194,12 +207,12 @@ def _hand(
     return travel, mass
 
 
-def _joint(columns: Mapping[str, Array], robot: Robot, k: int, name: str) -> Array:
+def _joint(columns: Columns, robot: Robot, k: int, name: str) -> Array:
     """Positions (k,) [rad] or [m] of a joint, by its number."""
     joint, slides = robot.joint_names[k], not _turns(robot, k)
     values = _column(columns, f"{joint}_{'m' if slides else 'rad'}", name)
     low, high = robot.lower[k], robot.upper[k]
-    values = check_array(f"{name}: {joint}", values, (np.size(columns[TIME]),), most=MOST)
+    values = check_array(f"{name}: {joint}", values, (np.size(_column(columns, TIME, name)),), most=MOST)
     far = np.maximum(values - high, low - values).max(initial=0.0)
     if not slides and far > _MAX_BEYOND:
         raise InputError(

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import MOST, InputError, check_array
+from impactopt.errors import MOST, InputError, check_direction, check_number
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.mass_matrix import mass_matrix
@@ -110,16 +110,16 @@ def striking_velocity(
     """Velocity (nv,) of least kinetic energy with the striking point at `speed` [m/s] along the normal.
 
     Frames fixed by the stance (None: all soles, or the fixed base) are at rest. The striking point does not
-    move at right angles to the normal (3,); its rotation is free. Least energy, unlike a least norm, does not
-    depend on the joints' units, and makes heavy links move little.
+    move at right angles to the normal (3,), a unit vector; its rotation is free. Least energy, unlike a least
+    norm, does not depend on the joints' units, and makes heavy links move little.
 
     Raises
     ------
-    InputError : wrong shapes or NaN; an unknown striker; a stance the robot cannot take; a posture in which
-        the striking point cannot move like that.
+    InputError : wrong shapes or NaN; no unit vector; an unknown striker; a stance the robot cannot take; a
+        posture in which the striking point cannot move like that.
     """
-    q, n = robot.check_configuration(q), check_array("normal", normal, (3,), most=MOST)
-    speed = float(check_array("speed [m/s]", speed, (), most=MOST))
+    q, n = robot.check_configuration(q), check_direction("normal", normal)
+    speed = check_number("speed [m/s]", speed, most=MOST)
     held_by = usual_stance(robot) if stance is None else stance
     frames = held_by.constraint_frames(robot)
     body = ConstrainedDynamics.at(robot.model, q, frames, robot.striker(striker).model_frame)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Collection, Mapping, Sequence
@@ -134,6 +135,22 @@ def touch_message(report: Mapping[str, Any]) -> str:
         for contact in (report, report["point"])
     )
     return f"contact of the link's hull: {hull}; of the striking point: {point}"
+
+
+def replayed_touches_message(report: Mapping[str, Any]) -> str:
+    """Sentence about bodies that hit each other in a replay, which loads the gears too; "" without any."""
+    pairs: dict[tuple[str, str], float] = {}  # first contact [s]
+    for touch in report.get("contacts_besides") or ():
+        pair = touch["one"], touch["other"]
+        pairs[pair] = min(float(touch["start_s"]), pairs.get(pair, math.inf))
+    if not pairs:
+        return ""
+    (one, other), start = min(pairs.items(), key=lambda item: item[1])
+    more = f" (and {len(pairs) - 1} more)" if len(pairs) > 1 else ""
+    return (
+        f"in the replay {one} and {other}{more} hit each other from {start:.3f} s on: gear loads and jumps "
+        "of joints' speeds include that"
+    )
 
 
 def _early(ms: float | None) -> str:

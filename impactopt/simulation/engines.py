@@ -19,6 +19,7 @@ from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.result import Scene, Simulation
+from impactopt.transcription.plan import Trajectory
 
 
 def scene_of(problem: ImpactProblem) -> Scene:
@@ -246,8 +247,9 @@ def _check_options(given: Mapping[str, Any], defaults: Mapping[str, Any], end: f
     if (tolerance := check_number("tolerance", options.get("tolerance", 0.0))) < 0:
         raise InputError(f"tolerance: {tolerance:g}; give a number >= 0")
     check_kind("missing", options.get("missing", False), bool)
-    if options.get("perturbation") is not None:
-        check_kind("perturbation", options["perturbation"], Perturbation)
+    for name, kind in {"perturbation": Perturbation, "missed": Trajectory}.items():
+        if options.get(name) is not None:
+            check_kind(name, options[name], kind)
     step = float(check_array("step [s]", options["step"], ()))
     # None of an engine that has a default of its own
     none = options["settle"] is None and defaults["settle"] is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -160,9 +161,13 @@ class TargetContact:
                 "more mass"
             )
         end, impulses = found.y[:, -1], found.y[h : 2 * h]
-        times = _with_both_sides(found.t, lambda t: bool(forces(t, found.sol(t))[0].any()))
-        states = found.sol(times)
-        values = np.array([forces(t, y)[0] for t, y in zip(times, states.T, strict=True)])
+
+        @cache
+        def found_forces(t: float) -> Array:
+            return forces(t, found.sol(t))[0]
+
+        times = _with_both_sides(found.t, lambda t: bool(found_forces(t).any()))
+        values = np.array([found_forces(t) for t in times])
         total = values.sum(axis=1)
         return Push(
             forces=impulses[:, -1] / step,
@@ -173,7 +178,7 @@ class TargetContact:
             depths=np.where(np.isfinite(depths), end[:h], -np.inf),
             times=times,
             total=total,
-            given=states[h : 2 * h].sum(axis=0),
+            given=found.sol(times)[h : 2 * h].sum(axis=0),
         )
 
     def untouched_step(self, state: Array, travel: float, step: float) -> tuple[Array, float]:

@@ -31,6 +31,7 @@ from impactopt.files.toml import (
 from impactopt.sweeps.collisions import Collisions, sweep_place
 from impactopt.sweeps.design import Axis, Column, Design, Draws, Span, column
 from impactopt.sweeps.sections import Figure, SpanSection, SweepFile, SweepSection, flat, of_other_kinds, put
+from impactopt.sweeps.table import PLAN_COLUMNS, PLAN_PREFIXES
 
 
 class VariedKeys:
@@ -330,10 +331,15 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
         _check_collisions(path, base, content, design)
     else:
         reader.check_values(grid, listed, over)
-    if content.figure is not None and given.case_kind == "collision":
-        known = [*reader.names, *given.outputs]
+    if content.figure is not None:
+        results, prefixes = given.outputs, tuple[str, ...]()
+        if given.case_kind != "collision":
+            names = (str(scenario["name"]) for scenario in base.data.get("scenarios", ()))
+            scenarios = (f"{name.replace(' ', '_')}_" for name in names)
+            results, prefixes = PLAN_COLUMNS, (*PLAN_PREFIXES, *scenarios)
+        known = [*reader.names, *results]
         for name in content.figure.renamed(reader.full_name).columns:
-            if name not in known:
+            if name not in known and not name.startswith(prefixes):
                 text = f"{name!r} is neither varied nor among the outputs{did_you_mean(name, known)}"
                 mistakes.append(Mistake(place=("figure",), sections=1, text=text))
     raise_if_any()

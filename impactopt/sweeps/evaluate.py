@@ -27,8 +27,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.design import Columns, Found, Unit, Work, failed_columns
-from impactopt.sweeps.progress import START
-from impactopt.sweeps.table import UNITS
+from impactopt.sweeps.table import START, SUMMARY_COLUMNS, UNITS
 
 ENDED_BY_WATCHDOG = -int(signal.SIGALRM)  # exit code of a process that the watchdog has ended
 MAX_BUILD_STEP = 900.0  # [s] for one step of building functions
@@ -64,21 +63,6 @@ class Watchdog:
 
 
 Evaluated = tuple[Columns, Mapping[int, Record]]
-
-# entries of a summary that are columns of the same name
-_COPIED = (
-    START,
-    "impulse_Ns",
-    "peak_force_N",
-    "contact_ms",
-    "hand_speed_m_s",
-    "duration_s",
-    "capture_margin_m",
-    "max_violation",
-    "iterations",
-    "solve_seconds",
-    "build_seconds",
-)
 
 
 def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Evaluated:
@@ -148,7 +132,7 @@ def _columns(summary: Mapping[str, Any], problem: ImpactProblem) -> Columns:
         "status": summary["status"],
         "reason": "" if usable else " ".join(filter(None, (summary["message"], summary.get("note")))),
     }
-    row |= {name: summary[name] for name in _COPIED if name in summary}
+    row |= {name: summary[name] for name in SUMMARY_COLUMNS if name in summary}
     row |= {f"target_{name}": value for name, value in (summary.get("target") or {}).items()}
     row |= {f"torque_ratio_{phase}": x for phase, x in summary.get("torque_ratio", {}).items()}
     row |= {f"zmp_margin_{phase}_m": x for phase, x in summary.get("zmp_margin_m", {}).items()}

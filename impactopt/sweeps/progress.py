@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from impactopt.errors import printable
 from impactopt.sweeps.design import Columns
-from impactopt.sweeps.table import merge_kinds
+from impactopt.sweeps.table import START, merge_kinds
 
 BEST = "impulse_Ns"
-START = "started_from"  # column with the solved case that a solve started from; "": none
 RATE_WINDOW = 30.0  # [s] over which the present rate is measured
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.e+-]*")
 

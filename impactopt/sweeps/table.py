@@ -42,6 +42,25 @@ UNITS = {
     "_s": "s",
 }
 
+START = "started_from"  # column with the solved case that a solve started from; "": none
+# entries of a plan's summary that are columns of the same name
+SUMMARY_COLUMNS = (
+    START,
+    "impulse_Ns",
+    "peak_force_N",
+    "contact_ms",
+    "hand_speed_m_s",
+    "duration_s",
+    "capture_margin_m",
+    "max_violation",
+    "iterations",
+    "solve_seconds",
+    "build_seconds",
+)
+PLAN_COLUMNS = ("case", "status", "reason", "seconds", *SUMMARY_COLUMNS)
+# prefixes of a plan's other columns, which its target and objectives determine
+PLAN_PREFIXES = ("target_", "torque_ratio_", "zmp_margin_", "objective_")
+
 
 def pyarrow() -> Any:
     """Module pyarrow, with its parquet.

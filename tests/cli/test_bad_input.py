@@ -325,3 +325,5 @@ def test_no_number_in_none_out() -> None:
             holding_torque(robot, q, np.full(robot.nv, bad))
     with pytest.raises(InputError):
         holding_torque(robot, q, np.full(robot.nv, 1e200))
+    with pytest.raises(InputError, match=r"normal: not a unit vector \(length 2\)"):
+        striking_velocity(robot, q, "hammer", 2 * normal, 1.0)

@@ -18,7 +18,7 @@ from support.fake_solution import PROBLEM_FILE, FakeSolution, MissingSolution, s
 from typer.testing import CliRunner
 
 import impactopt
-from impactopt import ImpactProblem, Solution, Status, load_record
+from impactopt import ImpactProblem, InputError, Solution, Status, load_record
 from impactopt.cli.app import app
 from impactopt.files.problem_file import ProblemFile
 from impactopt.files.record import Record
@@ -358,7 +358,12 @@ def test_an_interrupted_replay_keeps_the_plan(
 def test_an_interrupt_before_there_is_a_plan(planner: Planner, file: Path, tmp_path: Path) -> None:
     planner.raises = KeyboardInterrupt()
     _, err = run("solve", file, "--out", tmp_path / "out", code=130)
-    assert "interrupted" in err
+    assert "interrupted" in err and not (tmp_path / "out").exists()
+    planner.raises = InputError("no")
+    run("solve", file, "--out", tmp_path / "out", code=2)
+    assert {path.name for path in tmp_path.iterdir()} == {file.name}
+    run("validate", tmp_path, "--out", tmp_path / "out", "--animation", tmp_path / "a" / "b.gif", code=2)
+    assert {path.name for path in tmp_path.iterdir()} == {file.name}
 
 
 def test_sigterm_is_as_ctrl_c(planner: Planner, file: Path, tmp_path: Path) -> None:
@@ -451,6 +456,8 @@ def test_bad_arguments_exit_2(file: Path, tmp_path: Path, planner: Planner) -> N
     (tmp_path / "taken").write_text("")
     _, err = run("solve", file, "--out", tmp_path / "taken", code=2)
     assert "cannot make the directory" in err
+    _, err = run("solve", file, "--solver", "spq", code=2)
+    assert "did you mean 'sqp'" in " ".join(err.replace("│", "").split())
 
 
 def test_check_says_what_is_planned(file: Path) -> None:

@@ -21,7 +21,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import impactopt
-from impactopt import FullDynamics, Robot, load_problem, problem_names
+from impactopt import FullDynamics, InputError, Robot, load_problem, load_robot, problem_names
 from impactopt.cli.app import app
 from impactopt.cli.options import Quiet, Settings, command_line, complete_problem
 from impactopt.collide.single_collision import collide_once
@@ -108,6 +108,19 @@ def test_lists_as_json() -> None:
     arms = {row["name"]: row for row in json.loads(run("robots", "--json")[0])["robots"]}
     assert arms["planar_arm"]["joints"] == 3 and arms["planar_arm"]["strikers"] == ["hammer"]
     assert arms["planar_arm"]["mass_kg"] == pytest.approx(9.65)  # links of 5, 3 and 1 kg, and the hammer
+
+
+def test_a_robot_that_cannot_be_read_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(name: str) -> Robot:
+        if name == "talos":
+            raise InputError("its URDF is missing")
+        return load_robot(name)
+
+    monkeypatch.setattr("impactopt.robots.presets.load_robot", load)
+    found = json.loads(run("robots", "--json", code=2)[0])
+    assert found["ok"] is False and "joints" in found["robots"][-1]
+    assert {"name": "talos", "error": "its URDF is missing"} in found["robots"]
+    assert "talos: its URDF is missing" in run("robots", code=2)[0]
 
 
 def test_bad_input_is_told_as_json_too() -> None:

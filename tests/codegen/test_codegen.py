@@ -127,6 +127,16 @@ def test_hit_does_not_build(cache: Path, compilations: list[str]) -> None:
 
 
 @needs_compiler
+def test_a_compilation_that_nobody_waits_for_is_told_by_the_logger(
+    cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As that of a derivative of the collision, which CasADi evaluates for the first time."""
+    with caplog.at_level("INFO", "impactopt"):
+        cached("toy", (1, "b"), Builder())
+    assert caplog.messages[0] == "toy: building the functions" and "2 of 2" in caplog.messages[-1]
+
+
+@needs_compiler
 def test_recipe_name_and_sources_are_in_the_key(
     cache: Path, monkeypatch: pytest.MonkeyPatch, compilations: list[str]
 ) -> None:

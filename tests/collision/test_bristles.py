@@ -122,7 +122,7 @@ def test_stiff_bristles_are_friction_without_them() -> None:
 def test_friction_pushes_against_the_slide_in_the_tangent_plane() -> None:
     robot, n = biped(), np.array([0.8, 0.0, 0.6])
     q = robot.posture("half_sitting")
-    v = striking_velocity(robot, q, "fist", [1.0, 0.3, 0.0], 1.0)
+    v = striking_velocity(robot, q, "fist", [0.96, 0.28, 0.0], 1.0)
     model, data = robot.model, robot.model.createData()
     model.gravity = pin.Motion.Zero()
     shared = {"robot": robot, "striker": "fist", "normal": n, "target": FreeMass(mass=3.0)}

@@ -258,8 +258,11 @@ def test_options_that_mean_nothing_are_refused(options: dict[str, Any], message:
         ("time_s,force_N,hand_speed_m_s\n", "no rows"),
         ("time_s,force,hand_speed_m_s\n0,1,2\n", "did you mean 'force'"),
         ("time_s,force_N\n0,1\n", "no column hand_speed_m_s"),
-        ("time_s,force_N,hand_speed_m_s\n0,1\n", "row 2: 2 cells under 3"),
-        ("time_s,force_N,hand_speed_m_s\n0,many,2\n1,1,1\n", "force_N: nan at index 0"),
+        ("time_s,force_N,hand_speed_m_s\n0,1\n", "line 2: 2 cells under 3"),
+        ("time_s,force_N,hand_speed_m_s\n\n0,1,2\n1,many,1\n", "force_N: 'many' in line 4; give a number"),
+        ("time_s,force_N,hand_speed_m_s\n0,1,\n", "hand_speed_m_s: '' in line 2"),
+        ("time_s;force_N;hand_speed_m_s\n0,5;1,5;2,5\n", "separated by ';'; separate them by commas"),
+        ("time_s\tforce_N\n0\t1\n", r"separated by '\\t'"),
         ("time_s,time_s,force_N\n0,0,1\n", "two columns"),
     ],
 )

@@ -519,6 +519,8 @@ def test_engines_by_name_refuse_what_they_do_not_have(punch: Solution) -> None:
         ("mujoco", {"iterations": -3}, "iterations: -3; give a whole number from 1"),
         ("mujoco", {"tolerance": -1.0}, "tolerance: -1; give a number >= 0"),
         ("mujoco", {"perturbation": 3}, "perturbation must be a Perturbation, not 3"),
+        ("pinocchio", {"missed": 3}, "missed must be a Trajectory, not 3"),
+        ("mujoco", {"missed": True}, "missed must be a Trajectory, not True"),
     ],
 )
 def test_options_of_engines_are_checked(

@@ -198,6 +198,20 @@ def test_what_a_figure_names_has_to_be_there() -> None:
         sweep_from_data(collisions_data(kind="heat map"))
 
 
+def test_what_a_figure_of_plans_names_has_to_be_there() -> None:
+    """Told before a case is solved; columns of target, objectives and scenarios are known by prefixes."""
+    names = ("target.mass", "impulse_Ns", "target_speed_m_s", "torque_ratio_swing", "heavy_slow_impulse_Ns")
+    given: dict[str, Any] = {
+        "sweep": {"problem": "arm_planar"},
+        "grid": {"target.mass": [0.5, 1.0]},
+        "set": {"scenarios": [{"name": "heavy slow", "mass": 4.0}]},
+    }
+    for name in names:
+        assert sweep_from_data(given | {"figure": {"kind": "lines", "x": "target.mass", "y": name}}).figure
+    with pytest.raises(InputError, match=r"\[figure\]: 'impulse_N' is .*did you mean 'impulse_Ns'"):
+        sweep_from_data(given | {"figure": {"kind": "lines", "x": "target.mass", "y": "impulse_N"}})
+
+
 def test_a_sweep_is_the_same_with_another_figure() -> None:
     assert sweep_from_data(collisions_data()).hash == sweep_from_data(collisions_data(title="new")).hash
 

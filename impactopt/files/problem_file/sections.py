@@ -9,21 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Any, Literal, get_type_hints
 
-from pydantic import BaseModel, Field, PlainValidator, create_model
+from pydantic import BaseModel, create_model
 
 from impactopt.bodies.world import Ground, Obstacle
 from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
 from impactopt.files.problem_file.ipopt_options import IpoptOptions
-from impactopt.files.sections.collision import CollisionSections, ProblemSection, RigidSection, with_kinds
+from impactopt.files.sections.collision import CollisionSection, CollisionSections, ProblemSection, with_kinds
 from impactopt.files.sections.diagnostics import section_at
 from impactopt.files.sections.values import (
     AtLeastOne,
-    ContactDuration,
     Duration,
-    Fractions,
     NotNegative,
     Positive,
     Section,
@@ -35,7 +33,6 @@ from impactopt.files.sections.values import (
     sections_of,
 )
 from impactopt.files.toml import Place
-from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario, SecondStriker
@@ -161,42 +158,6 @@ class SwingSection(PhaseSection):
 
 class FollowSection(PhaseSection):
     """Follow-through, from the state after the impact to rest."""
-
-
-def touches_or_order(value: Any) -> Any:
-    """A whole number from 1 to 4, or a list of names."""
-    if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
-        return tuple(value)
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_TOUCHES:
-        raise ValueError(f"give a whole number from 1 to {MOST_TOUCHES}, or a list of names")
-    return value
-
-
-Touches = Annotated[Any, PlainValidator(touches_or_order)]
-
-
-class CollisionSection(RigidSection):
-    """Model and discretization of the collision."""
-
-    collision: Literal["rigid", "virtual-mass", "sdc-paper", "sdc", "full", "auto"] = optional(
-        '"full": the whole equation of motion; "sdc": frozen at contact; "sdc-paper": frozen, by the paper; '
-        '"auto": the cheapest that is accurate enough; "virtual-mass", "rigid": no duration',
-        "model",
-    )
-    freezes: Annotated[int, Field(ge=0, le=MOST_FREEZES)] = optional('of the model "sdc", during contact')
-    auto_impulse_pct: Positive = optional('of "auto": largest change of the impulse by full dynamics [%]')
-    auto_zmp_mm: Positive = optional('of "auto": largest change of the ZMP [mm]')
-    contact_duration: ContactDuration = optional(
-        "time of compression and of restitution [s]",
-        "duration_s",
-    )
-    collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
-    touches: Touches = optional(
-        "number of contacts with a board or a nail, or the ends of the contact's phases; left out: as of "
-        "point masses, of a nail one"
-    )
-    compression: Fractions = optional("lengths of its collocation elements")
-    restitution: Fractions = optional("lengths of its collocation elements")
 
 
 ScenarioSection: Any = section_of(Scenario)

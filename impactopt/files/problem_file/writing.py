@@ -18,7 +18,6 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import (
     ELEMENTS,
-    CollisionSection,
     File,
     FollowSection,
     GroundSection,
@@ -34,7 +33,14 @@ from impactopt.files.problem_file.sections import (
     comment_at,
     defaults_of,
 )
-from impactopt.files.sections.collision import LAWS, TARGETS, Body, FrictionSection, ProblemSection
+from impactopt.files.sections.collision import (
+    LAWS,
+    TARGETS,
+    Body,
+    CollisionSection,
+    FrictionSection,
+    ProblemSection,
+)
 from impactopt.files.sections.robot import RobotSection
 from impactopt.files.sections.values import Section
 from impactopt.files.toml import plain_value, write_toml

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, create_model
+from pydantic import ConfigDict, Field, PlainValidator, create_model
 
 from impactopt.bodies.world import TargetBody
 from impactopt.contact import laws, targets
@@ -20,7 +20,10 @@ from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
 from impactopt.files.sections.robot import RobotSection
 from impactopt.files.sections.values import (
+    ContactDuration,
+    Fractions,
     HandNames,
+    Positive,
     Posture,
     Preset,
     Restitution,
@@ -33,6 +36,7 @@ from impactopt.files.sections.values import (
     section_of,
 )
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, FixedBase, Free, OneSole, Stance
+from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
 from impactopt.robots.robot import Robot
 
 _FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # defaults
@@ -139,19 +143,55 @@ class StanceSection(Section):
 FrictionSection: Any = section_of(ContactFriction)
 
 
-class RigidSection(Section):
-    """[collision], of which a rigid impact needs one key; the others are a plan's, and are not checked."""
+def touches_or_order(value: Any) -> Any:
+    """A whole number from 1 to 4, or a list of names."""
+    if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
+        return tuple(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_TOUCHES:
+        raise ValueError(f"give a whole number from 1 to {MOST_TOUCHES}, or a list of names")
+    return value
 
-    collision: object = optional("", "model")
-    freezes: object = optional("")
-    auto_impulse_pct: object = optional("")
-    auto_zmp_mm: object = optional("")
+
+Touches = Annotated[Any, PlainValidator(touches_or_order)]
+
+
+class CollisionSection(Section):
+    """Model and discretization of the collision."""
+
+    collision: Literal["rigid", "virtual-mass", "sdc-paper", "sdc", "full", "auto"] = optional(
+        '"full": the whole equation of motion; "sdc": frozen at contact; "sdc-paper": frozen, by the paper; '
+        '"auto": the cheapest that is accurate enough; "virtual-mass", "rigid": no duration',
+        "model",
+    )
+    freezes: Annotated[int, Field(ge=0, le=MOST_FREEZES)] = optional('of the model "sdc", during contact')
+    auto_impulse_pct: Positive = optional('of "auto": largest change of the impulse by full dynamics [%]')
+    auto_zmp_mm: Positive = optional('of "auto": largest change of the ZMP [mm]')
     coefficient_of_restitution: Restitution = optional('of "rigid": speed of separation over approach')
-    contact_duration: object = optional("", "duration_s")
-    collision_stages: object = optional("", "stages")
-    touches: object = optional("")
-    compression: object = optional("")
-    restitution: object = optional("")
+    contact_duration: ContactDuration = optional(
+        "time of compression and of restitution [s]",
+        "duration_s",
+    )
+    collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
+    touches: Touches = optional(
+        "number of contacts with a board or a nail, or the ends of the contact's phases; left out: as of "
+        "point masses, of a nail one"
+    )
+    compression: Fractions = optional("lengths of its collocation elements")
+    restitution: Fractions = optional("lengths of its collocation elements")
+
+
+# a rigid impact needs one key: the others are a plan's, and are not checked
+_UNCHECKED: dict[str, Any] = {
+    name: (object, optional("", info.alias))
+    for name, info in CollisionSection.model_fields.items()
+    if name != "coefficient_of_restitution"
+}
+RigidSection: Any = create_model(
+    "RigidSection",
+    __base__=CollisionSection,
+    __doc__="[collision], of which only the coefficient of restitution is checked.",
+    **_UNCHECKED,
+)
 
 
 class CollisionSections(Section):

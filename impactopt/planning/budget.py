@@ -157,8 +157,7 @@ class Budget:
         given = (self.options or {}).get("max_iterations")
         return None if given is None else max(int(given) - self.spent.iterations, 0)
 
-    @property
-    def over(self) -> bool:
+    def is_over(self) -> bool:
         """True if no time is left, or no iterations of this start."""
         return self.left == 0 or self.iterations_left == 0
 

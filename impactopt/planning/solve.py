@@ -172,7 +172,7 @@ def _planned(
     # A solution of a similar problem is more than an estimate, so with one all iterations are allowed.
     outcome = _best(guesses, len(which), solver, doubted=bool(doubts) and not isinstance(given, SolverResult))
     violated = ended_with_violations(outcome.program, outcome.result)
-    if isinstance(given, str) and given == "reach" and violated and not budget.over:
+    if isinstance(given, str) and given == "reach" and violated and not budget.is_over():
         outcome = _else_from_plain_posture(t, outcome, solver)
     if refined and margins is None:
         outcome = solver.on(outcome)
@@ -268,7 +268,8 @@ class PlanSolver:
         if not self.refined:
             return outcome if self.margins is not None else self._retried(outcome)
         # A program without clearance constraints would be solved again as it is.
-        if self._stuck(outcome.result) and outcome.program.clearance_constraints and not self.budget.over:
+        stuck = self._stuck(outcome.result) and not self.budget.is_over()
+        if stuck and outcome.program.clearance_constraints:
             outcome = self._solved_without_clearance(outcome)
         else:
             outcome = self._between(outcome)
@@ -348,7 +349,7 @@ def _diagnosed(
     """
     budget, old = solver.budget, outcome.result
     limited = old.status is Status.ITERATION_LIMIT and "max_iterations" in (budget.options or {})
-    if limited or not ended_with_violations(outcome.program, old) or budget.over:
+    if limited or not ended_with_violations(outcome.program, old) or budget.is_over():
         return outcome, ()
     # Prices exclude no motion, but with them the solver may stall on the way to one.
     if outcome.origin.program.problem.style_prices != MotionPrices():
@@ -360,11 +361,11 @@ def _diagnosed(
         if both.usable:
             return both, ()
         outcome = replace(outcome, result=with_effort_of(old, both.result))
-        if budget.over:
+        if budget.is_over():
             return outcome, ()
     budget.say("no motion meets all bounds: searching for the bound that would have to change")
     found = search(outcome.program, old, budget)
-    if found.met is None or budget.over:
+    if found.met is None or budget.is_over():
         return outcome, found.causes
     budget.say("a motion that meets all bounds was found: solving from it")
     program, x = found.met

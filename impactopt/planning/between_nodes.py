@@ -72,7 +72,7 @@ class BetweenNodes:
     def missing(self, outcome: Outcome[Transcription]) -> Additions[Transcription] | None:
         """Nodes, contact elements and clearance constraints that a solution lacks."""
         t, x, violated = outcome.program, outcome.result.x, None
-        if self._budget.left == 0:
+        if self._budget.is_over():
             return None
         with contextlib.suppress(InputError):  # legs out of reach: completing the motion reports it
             if self._margins is not None:

@@ -74,13 +74,23 @@ def stopping() -> Iterator[Stop]:
             signal.signal(number, signal.default_int_handler)
 
 
+@dataclass
+class Spent:
+    """Number of iterations of all calls of a solver from one start."""
+
+    iterations: int = 0
+
+
 @dataclass(frozen=True, kw_only=True)
 class Budget:
     """Solver with its options, and the time limit [s] of all its calls together; None: no limit.
 
+    The option `max_iterations`, if it is given, is the limit of all calls from one start together.
+
     callback : called with each iteration's record; True stops the solver.
     report : called with lines of text.
     since : when the time began (`time.perf_counter`).  stop : flag that Ctrl-C sets.
+    spent : iterations of the present start.
 
     Raises
     ------
@@ -95,6 +105,7 @@ class Budget:
     report: Callable[[str], None] | None = None
     since: float = field(default_factory=time.perf_counter)
     stop: Stop = field(default_factory=Stop)
+    spent: Spent = field(default_factory=Spent)
 
     def __post_init__(self) -> None:
         check_choice("unknown solver", self.solver, SOLVERS)
@@ -116,6 +127,10 @@ class Budget:
         self.stop.armed = True
         return replace(self, since=time.perf_counter())
 
+    def begin_start(self) -> None:
+        """Count iterations anew, for another start."""
+        self.spent.iterations = 0
+
     def near_by(self) -> Budget:
         """Budget for an initial guess that is nearly a solution: the solver hardly moves it off its bounds,
         as from a moved one it may converge to another solution.
@@ -135,6 +150,16 @@ class Budget:
         if self.time_limit is None:
             return None
         return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
+
+    @property
+    def iterations_left(self) -> int | None:
+        """Remaining iterations; None without a given limit."""
+        given = (self.options or {}).get("max_iterations")
+        return None if given is None else max(int(given) - self.spent.iterations, 0)
+
+    def is_over(self) -> bool:
+        """True if no time is left, or no iterations of this start."""
+        return self.left == 0 or self.iterations_left == 0
 
     def say(self, text: str) -> None:
         """Reports a line of text."""
@@ -161,7 +186,7 @@ class Budget:
         start : initial guess (n,); or a similar program's result for a warm start, whose multipliers our
         solvers use too.
         barrier : first one of "ipm" for a warm start, if that is farther from the solution than it seems.
-        most : largest number of iterations of our solvers, unless the options set it.
+        most : largest number of iterations of our solvers, unless the options set that of all calls.
         watch, state : as of `solve_ipm`.
         """
         # After a stop the callback ends the solve at its first iterate; a limit of no
@@ -176,17 +201,23 @@ class Budget:
                 program, x0, options=self.options, callback=self._on_iteration, time_limit=left
             )
         settings = dict(self.options or {})
-        if most is not None:
-            settings.setdefault("max_iterations", most)
+        if self.iterations_left is not None:
+            settings["max_iterations"] = self.iterations_left
+        elif most is not None:
+            settings["max_iterations"] = most
         if left is not None:
             # The options refuse 0.
             settings["time_limit"] = max(left, 1e-9)
         common: dict[str, Any] = {"callback": self._on_iteration, "multipliers": y, "bound_multipliers": z}
-        if not self.interior:
-            return solve_sqp(program, x0, options=SQPOptions(**settings), **common)
-        if barrier is not None and z is not None:
-            settings.setdefault("barrier_warm", barrier)
-        return solve_ipm(program, x0, options=IPMOptions(**settings), watch=watch, state=state, **common)
+        if self.interior:
+            if barrier is not None and z is not None:
+                settings.setdefault("barrier_warm", barrier)
+            options = IPMOptions(**settings)
+            result = solve_ipm(program, x0, options=options, watch=watch, state=state, **common)
+        else:
+            result = solve_sqp(program, x0, options=SQPOptions(**settings), **common)
+        self.spent.iterations += result.iterations
+        return result
 
 
 def rank_of(result: SolverResult) -> tuple[bool, float]:

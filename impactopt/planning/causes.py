@@ -75,7 +75,7 @@ def search(t: Transcription, result: SolverResult, budget: Budget) -> Search:
 
     result : of the program, with the least violation that its solver found.
     """
-    if budget.left == 0:
+    if budget.is_over():
         return Search()
     try:
         return _CauseSearch(t, result, budget).found()
@@ -182,7 +182,7 @@ class _CauseSearch:
             new = changed_or_none(p, law=law)
             if new is None:
                 continue
-            if self._budget.left == 0:
+            if self._budget.is_over():
                 return
             t = program_for(self.t.with_clearance({}), new)
             if self._run(t.program, first_iterate(t), _ITERATIONS_STIFFNESS) is not None:

@@ -33,7 +33,7 @@ def ipopt_retry(budget: Budget, program: NonlinearProgram, start: Array, old: So
     set is a diagnosis.
     """
     undiagnosed = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
-    if budget.solver == "ipopt" or not undiagnosed or budget.left == 0:
+    if budget.solver == "ipopt" or not undiagnosed or budget.is_over():
         return old
     violation = max_violation(program, old.x, program.constraints(old.x))
     if old.status is Status.FAILED and violation <= VIOLATED < old.max_violation:

@@ -151,7 +151,7 @@ def with_gains_fixed(
     # The robot with chosen gains may have other torque limits than the one with room for the stiffest.
     result = _with_rescaled_torques(new, t.robot, carried(new, t, old))
     # Without a solution, or time, the last iterate stays, on the robot with its gains.
-    if old.status.usable and budget.left != 0:
+    if old.status.usable and not budget.is_over():
         polished = budget.near_by().run(new.program, result, _BARRIER)
         if polished.status.usable:
             result = one_after_the_other(old, polished)

@@ -129,6 +129,7 @@ def best_of(
     for k, (name, make) in enumerate(guesses):
         if k >= count and (alike > 1 or not all(outcome.refused for _, outcome in found)):
             break
+        budget.begin_start()
         new = solve(make())
         alike = max(alike, 1 + sum(_alike(new, outcome) for _, outcome in found))
         found.append((name, new))

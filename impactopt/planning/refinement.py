@@ -271,7 +271,7 @@ def refine(
         met = outcome.usable or (oracle.of_refused and outcome.refused)
         lacks = oracle.missing(outcome) if met else None
         # without rounds or time left, a solution that is not valid without the additions becomes a failure
-        if lacks is None or (0 in (left, budget.left) and not lacks.without):
+        if lacks is None or ((left == 0 or budget.is_over()) and not lacks.without):
             break
         if left == 0:
             message = f"{oracle.most} rounds of {lacks.name} are not enough. {lacks.without}"
@@ -298,7 +298,7 @@ def _first_usable(
     for guess in guesses:
         new = solve(guess)
         done = new if done is None else done.else_then(new)
-        if new.usable or new.result.status is Status.INTERRUPTED or budget.left == 0:
+        if new.usable or new.result.status is Status.INTERRUPTED or budget.is_over():
             break
     assert done is not None
     return done

@@ -351,7 +351,7 @@ def _polished(budget: Budget, t: Transcription, old: SolverResult) -> SolverResu
     starts = (_FAR_START, _NEAR_START) if far else (_NEAR_START, _FAR_START)
     result: SolverResult | None = None
     for (barrier, push), most in zip(starts, (_ITERATIONS_FIRST, None), strict=True):
-        if result and (result.status.usable or result.status is Status.INTERRUPTED or budget.left == 0):
+        if result and (result.status.usable or result.status is Status.INTERRUPTED or budget.is_over()):
             break
         pushed = replace(budget, options={"push_warm": push, **(budget.options or {})})
         new = pushed.run(t.program, old, barrier, most)

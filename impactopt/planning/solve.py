@@ -54,7 +54,7 @@ from impactopt.transcription.transcription import Transcription, statement_of
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
-_HOPELESS_ITERATIONS = 100  # of each solve of a problem that is unlikely to have a solution
+_HOPELESS_ITERATIONS = 100  # of each start of a problem that is unlikely to have a solution
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 
 
@@ -98,7 +98,8 @@ def solve(
         Seed of the drawn initial guesses.
     options : mapping, optional
         Options of the solver: those of :class:`impactopt.solvers.ipm.IPMOptions`,
-        :class:`impactopt.solvers.sqp.SQPOptions`, or IPOPT's.
+        :class:`impactopt.solvers.sqp.SQPOptions`, or IPOPT's. A given `max_iterations` is the limit of all
+        programs of a start together: those of its refinement, too.
     time_limit : float, optional
         Time [s] for all starts together, without compiling functions.
     workers : int
@@ -171,7 +172,7 @@ def _planned(
     # A solution of a similar problem is more than an estimate, so with one all iterations are allowed.
     outcome = _best(guesses, len(which), solver, doubted=bool(doubts) and not isinstance(given, SolverResult))
     violated = ended_with_violations(outcome.program, outcome.result)
-    if isinstance(given, str) and given == "reach" and violated and budget.left != 0:
+    if isinstance(given, str) and given == "reach" and violated and not budget.is_over():
         outcome = _else_from_plain_posture(t, outcome, solver)
     if refined and margins is None:
         outcome = solver.on(outcome)
@@ -267,7 +268,8 @@ class PlanSolver:
         if not self.refined:
             return outcome if self.margins is not None else self._retried(outcome)
         # A program without clearance constraints would be solved again as it is.
-        if self._stuck(outcome.result) and outcome.program.clearance_constraints and self.budget.left != 0:
+        stuck = self._stuck(outcome.result) and not self.budget.is_over()
+        if stuck and outcome.program.clearance_constraints:
             outcome = self._solved_without_clearance(outcome)
         else:
             outcome = self._between(outcome)
@@ -347,7 +349,7 @@ def _diagnosed(
     """
     budget, old = solver.budget, outcome.result
     limited = old.status is Status.ITERATION_LIMIT and "max_iterations" in (budget.options or {})
-    if limited or not ended_with_violations(outcome.program, old) or budget.left == 0:
+    if limited or not ended_with_violations(outcome.program, old) or budget.is_over():
         return outcome, ()
     # Prices exclude no motion, but with them the solver may stall on the way to one.
     if outcome.origin.program.problem.style_prices != MotionPrices():
@@ -359,11 +361,11 @@ def _diagnosed(
         if both.usable:
             return both, ()
         outcome = replace(outcome, result=with_effort_of(old, both.result))
-        if budget.left == 0:
+        if budget.is_over():
             return outcome, ()
     budget.say("no motion meets all bounds: searching for the bound that would have to change")
     found = search(outcome.program, old, budget)
-    if found.met is None or budget.left == 0:
+    if found.met is None or budget.is_over():
         return outcome, found.causes
     budget.say("a motion that meets all bounds was found: solving from it")
     program, x = found.met

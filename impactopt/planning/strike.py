@@ -209,7 +209,7 @@ def clear_strike(
         )
 
     outcome = solve(replace(guess, barrier=BARRIER_WARM))
-    if guess.warm is not None and outcome.result.status in _STUCK and budget.left != 0:
+    if guess.warm is not None and outcome.result.status in _STUCK and not budget.is_over():
         outcome = outcome.then(solve(Guess(program=t.with_clearance({}), start=guess.x)))
     return outcome
 

@@ -20,7 +20,7 @@ class SolverOptions:
     violation_tolerance : largest violation at a solution.
     kkt_tolerance : largest scaled stationarity and complementarity at a solution.
     acceptable_tolerance : kkt_tolerance of the status ACCEPTABLE, if no step helps.
-    max_iterations : most iterations.
+    max_iterations : most iterations of one program; if given, of all programs of a start together.
     time_limit : [s]; then the best iterate is returned.
     price : initial price of violations, which rises if necessary.
     price_max : largest price of violations.

@@ -316,7 +316,7 @@ def _robots(
     ] = None,
     targets: Annotated[
         int,
-        typer.Option(min=0, metavar="N", help="Compare an arm's strike with the best on N random targets."),
+        typer.Option(min=0, metavar="N", help="Compare an arm's motion with the best to N random targets."),
     ] = 0,
     motion: Annotated[
         str | None, typer.Option(metavar="NAME", help="Motion that is drafted, as of `impactopt new`.")

@@ -1,4 +1,4 @@
-"""Starts beyond those asked for: tried while solutions are refused, and no more once two end alike."""
+"""Starts: their limits, and those beyond the ones asked for, while solutions are refused and differ."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from support.small_plans import Planned
 
-from impactopt import Status
+from impactopt import NotSolvedWarning, Status, load_problem, solve
 from impactopt.planning.budget import Budget
 from impactopt.planning.multistart import best_of
 from impactopt.planning.refinement import Guess, Outcome
@@ -55,3 +55,11 @@ def test_starts_that_end_otherwise_are_followed_by_another(
     assert len(best.attempts) == 3 and best.usable
     assert [attempt.kept for attempt in best.attempts] == [False, False, True]
     assert "alike" not in best.result.message
+
+
+def test_a_limit_of_iterations_is_of_all_programs_of_each_start() -> None:
+    """The seventh iterate of this arm lacks a clearance constraint, so that a second program is solved."""
+    with pytest.warns(NotSolvedWarning, match="iteration limit"):
+        solution = solve(load_problem("arm7"), options={"max_iterations": 10}, starts=2)
+    assert solution.status is Status.ITERATION_LIMIT
+    assert [attempt.iterations for attempt in solution.attempts] == [10, 10]

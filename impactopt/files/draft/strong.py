@@ -39,7 +39,7 @@ BEHIND = 0.06, 0.15
 DURATION_FACTORS = (0.8, 3.0)  # shortest and longest duration over the time at the velocity limits
 AFTER = 0.6  # [s] in which a target that flies away may not meet the base
 AFTER_STEP = 0.03  # [m] of its travel between two tests
-ITERATIONS, SECONDS = 150, 30.0  # limits of a trial strike or plan: most need a third of that
+ITERATIONS, SECONDS = 300, 30.0  # limits of a trial strike or plan: most need a sixth of that
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

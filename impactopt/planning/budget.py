@@ -183,7 +183,7 @@ class Budget:
             settings["time_limit"] = max(left, 1e-9)
         common: dict[str, Any] = {"callback": self._on_iteration, "multipliers": y, "bound_multipliers": z}
         if not self.interior:
-            return solve_sqp(program, x0, options=SQPOptions(**settings), **common)
+            return solve_sqp(program, x0, options=SQPOptions(**settings), watch=watch, state=state, **common)
         if barrier is not None and z is not None:
             settings.setdefault("barrier_warm", barrier)
         return solve_ipm(program, x0, options=IPMOptions(**settings), watch=watch, state=state, **common)

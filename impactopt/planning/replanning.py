@@ -379,7 +379,9 @@ def _by_active_set(solution: Solution, t: Transcription, family: ParametricProgr
     """
     program, began = t.program, time.perf_counter()
     system, residual_before = family.steady
-    at, best, worst = Change(x=system.x, y=system.y, z=system.z), None, np.inf
+    at = Change(x=system.x, y=system.y, z=system.z)
+    # The solution itself, if the changed program is not finite at the first step.
+    best, worst, steps = at, np.inf, 0
     for taken in range(1 + _MAX_CORRECTIONS):
         residual = system.offset(program, at)
         step = system.step(residual.less(residual_before))
@@ -391,7 +393,6 @@ def _by_active_set(solution: Solution, t: Transcription, family: ParametricProgr
         best, worst, steps = at, violation, taken + 1
         if worst <= _SMALL_VIOLATION:
             break
-    assert best is not None
     # a multiplier of the wrong sign: its inequality or bound is no longer active
     inequality, free = program.g_lower < program.g_upper, program.x_lower < program.x_upper
     released_y, released_z = (

@@ -186,6 +186,14 @@ def test_a_program_that_does_not_follow_is_built_anew(arm: Solution) -> None:
     assert lower == pytest.approx([moved.problem.point[2] - 10.0])
 
 
+def test_a_plan_that_is_not_finite_at_the_first_step_stays(arm: Solution, monkeypatch: Any) -> None:
+    monkeypatch.setattr("impactopt.solvers.predictor.Predictor.predict", lambda *_: None)
+    monkeypatch.setattr("impactopt.planning.replanning.max_violation", lambda *_: np.inf)
+    moved = arm.moved(mass=1.1 * arm.problem.target.mass, polish=False)
+    assert not moved.status.usable
+    assert moved.result.x == pytest.approx(arm.result.x, abs=1e-6)
+
+
 def test_what_cannot_be_bent_is_said(arm: Solution) -> None:
     with pytest.raises(InputError, match=r"moved: a plan has no parameter 'masss' \(did you mean 'mass'\?\)"):
         arm.moved(masss=0.06)

@@ -6,8 +6,8 @@ inertia correction takes the place of a convex Hessian. A QP is solved inexactly
 which falls as the iterates converge; near a solution a QP takes one or two Newton steps.
 
 Barrier parameter, line search and elastic constraints are those of the interior-point method
-(`ipm.interior_point`), whose step is the first Newton step of the QP. That is also the step that is tried if
-the QP's is refused, and that is taken while constraints are elastic.
+(`ipm.interior_point`), whose step is the first Newton step of the QP. That step is also tried if the QP's is
+refused, and is taken far from the constraints and while they are elastic.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from impactopt.solvers.options import IPMOptions, SolverOptions, SQPOptions
 from impactopt.solvers.program import Status, Vector
 from impactopt.solvers.run import BarrierState, Watch
 
+_MAX_VIOLATION = 1.0  # of an iterate whose QP is solved: farther from the constraints Newton steps do better
 _MAX_NEWTON_STEPS = 40  # of one QP; its last iterate is used as it is
 _MAX_STEP = 1e3  # of a variable; the QP has no bound then
 _MAX_GROWTH = 30.0  # of the violation, from the first iterate with a barrier parameter
@@ -48,7 +49,7 @@ class InteriorQPRun(InteriorRun):
 
     def _advance(self, residual: Vector) -> str | Status:
         problem = self._problem
-        if problem.elastic is None:
+        if problem.elastic is None and problem.point.max_violation <= _MAX_VIOLATION:
             begin = self.report.elapsed()
             step, taken = _solve_qp(problem)
             self.report.seconds_qp += self.report.elapsed() - begin

@@ -215,7 +215,9 @@ class Budget:
             options = IPMOptions(**settings)
             result = solve_ipm(program, x0, options=options, watch=watch, state=state, **common)
         else:
-            result = solve_sqp(program, x0, options=SQPOptions(**settings), **common)
+            result = solve_sqp(
+                program, x0, options=SQPOptions(**settings), watch=watch, state=state, **common
+            )
         self.spent.iterations += result.iterations
         return result
 

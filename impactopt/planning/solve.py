@@ -83,8 +83,8 @@ def solve(
         the path of a problem file, or the name of one that comes with the package (`impactopt problems`);
         its [solver] section then holds where nothing else is given.
     solver : {"ipm", "sqp", "ipopt"}
-        "ipm" is our primal-dual interior-point method; "sqp" our SQP, which solves its QPs to their end, by
-        OSQP, for small programs.
+        "ipm" is our primal-dual interior-point method; "sqp" our SQP, which solves each QP to its end: by
+        OSQP if the program is small, else by the interior-point method.
     start : str, array_like (n,) or Solution
         Initial guess. "reach": a plain reach to the target; "strike": the same with the state at contact of
         the hardest impact near by, which is a program of its own (:func:`impactopt.optimize_strike`); solver

@@ -89,18 +89,19 @@ class SQPOptions(SolverOptions):
 
     Attributes
     ----------
-    qp_solver : name in `QP_SOLVERS`.
+    qp_solver : name in `QP_SOLVERS`; "ipm", the interior-point method, which ignores `hessian` and `radius`;
+        or "auto": "osqp" for at most 300 free variables, "ipm" for more.
     hessian : "exact" (made convex) or "bfgs" (damped; for some hundred free variables at most).
     radius : largest radius of the trust region |d|_inf <= radius.
     """
 
-    qp_solver: str = "osqp"
+    qp_solver: str = "auto"
     hessian: str = "exact"
     radius: float = 1.0
 
     def __post_init__(self) -> None:
         """Check names, then as `SolverOptions` does."""
-        check_qp_solver(self.qp_solver, QP_SOLVERS)
+        check_qp_solver(self.qp_solver, [*QP_SOLVERS, "auto", "ipm"])
         check_choice("hessian", self.hessian, HESSIANS)
         super().__post_init__()
 

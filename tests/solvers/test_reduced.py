@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from benchmarks.solve import planning_program, strike_program
 from support.textbook import INF, Textbook, assert_optimal
 
 import impactopt.solvers.sqp.reduced_qp as reduced_qp_module
+import impactopt.solvers.sqp.solver as solver_module
 from impactopt import Status
 from impactopt.files.named_problems import problem_file
 from impactopt.solvers.ipm import solve_ipm
@@ -23,6 +26,7 @@ WAYS = {
     "osqp": SQPOptions(qp_solver="osqp"),
     "active_set": SQPOptions(qp_solver="active_set"),
     "bfgs": SQPOptions(qp_solver="osqp", hessian="bfgs"),
+    "ipm": SQPOptions(qp_solver="ipm"),
 }
 
 
@@ -60,9 +64,33 @@ def test_optima_are_those_of_the_whole_program(way: str) -> None:
     assert (program.evaluations["hessian"] == 0) == (way == "bfgs")
 
 
-@pytest.mark.parametrize("way", WAYS)
+def test_qps_of_the_interior_point_method_converge_fast_near_a_solution() -> None:
+    options = WAYS["ipm"]
+    found = solve_sqp(chain(), [0.5, 0.0, 0.0, 0.5], options=options)
+    near = solve_sqp(
+        chain(),
+        found.x + 1e-2,
+        options=options,
+        multipliers=found.multipliers,
+        bound_multipliers=found.bound_multipliers,
+    )
+    assert near.status is Status.SOLVED
+    violations = [record.max_violation for record in near.history]
+    assert len(violations) <= 5
+    # each linearization squares what is off
+    assert all(b <= max(10 * a**2, 1e-6) for a, b in itertools.pairwise(violations))
+
+
+def test_large_programs_get_qps_of_the_interior_point_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solver_module, "MAX_DENSE", 1)
+    result = solve_sqp(chain(), [0.5, 0.0, 0.0, 0.5])
+    assert result.status is Status.SOLVED
+    assert "barrier" in result.history[-1].note
+
+
+@pytest.mark.parametrize("way", [way for way in WAYS if way != "ipm"])
 def test_matrices_are_sparse_where_many_variables_are_free(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduced_qp_module, "_MAX_DENSE", 1)
+    monkeypatch.setattr(reduced_qp_module, "MAX_DENSE", 1)
     program = chain()
     result = solve_sqp(program, [0.5, 0.0, 0.0, 0.5], options=WAYS[way])
     assert result.status is Status.SOLVED
@@ -77,7 +105,7 @@ def test_matrices_are_sparse_where_many_variables_are_free(way: str, monkeypatch
 
 
 def test_a_hessian_that_is_not_convex_is_lifted_and_stays_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduced_qp_module, "_MAX_DENSE", 1)
+    monkeypatch.setattr(reduced_qp_module, "MAX_DENSE", 1)
     bent = Chain(
         4,
         lambda a, b, c, d: ca.cos(3 * a) - 2 * (d - 0.2) ** 2 + c,

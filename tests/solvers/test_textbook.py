@@ -21,7 +21,7 @@ from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, SQPOptions, make_qp_solv
 EXACT = {"tol": 1e-9, "bound_relax_factor": 0.0}
 # for six digits of an objective however many bounds hold
 SHARP = IPMOptions(complementarity_tolerance=1e-8)
-WAYS = {"default": IPMOptions(), "osqp": SQPOptions(qp_solver="osqp")}
+WAYS = {"default": IPMOptions(), "osqp": SQPOptions(qp_solver="osqp"), "sqp_ipm": SQPOptions(qp_solver="ipm")}
 
 
 @functools.cache

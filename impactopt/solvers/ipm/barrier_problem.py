@@ -14,6 +14,7 @@ section 2.3.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -21,7 +22,7 @@ import numpy as np
 
 from impactopt.solvers.ipm.newton import acquire, release
 from impactopt.solvers.options import IPMOptions
-from impactopt.solvers.program import Determined, Point, TimedProgram, Vector, scaled_residual
+from impactopt.solvers.program import Determined, Matrix, Point, TimedProgram, Vector, scaled_residual
 from impactopt.solvers.run import BarrierState
 
 _KAPPA_SIGMA = 1e10  # multipliers of bounds stay within this factor of mu / distance (eq. 16)
@@ -300,9 +301,12 @@ class Filter:
     pairs: list[tuple[float, float]] = field(default_factory=list)
 
     @classmethod
-    def from_violation(cls, theta: float) -> Filter:
-        """Empty filter for iterates from a point with this violation (section 3.3)."""
-        return cls(theta_min=1e-4 * max(1.0, theta), theta_max=1e4 * max(1.0, theta))
+    def from_violation(cls, theta: float, max_growth: float) -> Filter:
+        """Empty filter for iterates from a point with this violation (section 3.3).
+
+        max_growth : largest violation of a point, relative to that of the first, or to 1; the paper's: 1e4.
+        """
+        return cls(theta_min=1e-4 * max(1.0, theta), theta_max=max_growth * max(1.0, theta))
 
     def min_length(self, start: SearchStart) -> float:
         """Step length below which no acceptable point is expected (eq. 23)."""
@@ -361,9 +365,11 @@ _S_MAX = 100.0  # mean multiplier beyond which errors are scaled (eq. 5 and 6)
 
 @dataclass
 class Step:
-    """Newton step d (n,) of all variables, with the free (f,) and the slacks' (i,) parts.
+    """Step d (n,) of all variables, with the free (f,) and the slacks' (i,) parts.
 
     y : new multipliers of the constraints that remain.  eliminated_y : of the eliminated ones.
+    end : free variables and slacks at the step's end, with the multipliers of their bounds, if it leads to a
+        QP's solution; None for a Newton step, along which these multipliers follow linearly.
     """
 
     d: Vector
@@ -371,6 +377,7 @@ class Step:
     slack: Vector
     y: Vector
     eliminated_y: Vector
+    end: tuple[Bounded, Bounded] | None = None
 
 
 @dataclass
@@ -381,6 +388,37 @@ class Trial:
     slack: Vector
     theta: float
     phi: float
+
+
+class QuadraticModel:
+    """QP of a program at a point, as a `NonlinearProgram` with the same variables and patterns.
+
+    The Hessian is that of the Lagrangian, and the constraints are linearized.
+    """
+
+    def __init__(self, program: TimedProgram, at: Point, multipliers: Vector):
+        """multipliers : of the constraints (m,), in the Lagrangian."""
+        self.n, self.m = program.n, program.m
+        self.x_lower, self.x_upper = program.x_lower, program.x_upper
+        self.g_lower, self.g_upper = program.g_lower, program.g_upper
+        self.constraint_name, self.variable_name = program.constraint_name, program.variable_name
+        self._at, self._hessian = at, program.hessian(at.x, 1.0, multipliers)
+
+    def objective(self, x: Vector) -> float:
+        d = x - self._at.x
+        return self._at.objective + float(self._at.gradient @ d + 0.5 * d @ (self._hessian @ d))
+
+    def gradient(self, x: Vector) -> Vector:
+        return np.asarray(self._at.gradient + self._hessian @ (x - self._at.x))
+
+    def constraints(self, x: Vector) -> Vector:
+        return np.asarray(self._at.g + self._at.jacobian @ (x - self._at.x))
+
+    def jacobian(self, _x: Vector) -> Matrix:
+        return self._at.jacobian
+
+    def hessian(self, _x: Vector, sigma: float, _multipliers: Vector) -> Matrix:
+        return sigma * self._hessian
 
 
 class BarrierProblem:
@@ -614,6 +652,25 @@ class BarrierProblem:
             self.elastic.set_step(y, self.y, self.mu)
         return Step(d, d[c.free], slack, y, of_all[c.eliminated])
 
+    # ------------------------------------------------------------------ quadratic model
+    def quadratic(self) -> BarrierProblem:
+        """Barrier problem of the QP at the iterate: the program's quadratic model, linearized constraints.
+
+        It begins at the iterate, and shares the Newton system.
+        """
+        model = QuadraticModel(self.program, self.point, self.constraint_multipliers)
+        out = copy.copy(self)
+        out.program = TimedProgram(model)
+        out.point = out.program.point(self.point.x)
+        out.x, out.s = copy.copy(self.x), copy.copy(self.s)
+        return out
+
+    def step_to(self, end: BarrierProblem) -> Step:
+        """Step to the iterate of the QP's barrier problem (`quadratic`)."""
+        d = end.point.x - self.point.x
+        slack = end.s.values - self.s.values
+        return Step(d, d[self._condenser.free], slack, end.y, end.eliminated_y, (end.x, end.s))
+
     # ------------------------------------------------------------------ along a step
     @property
     def tau(self) -> float:
@@ -622,6 +679,8 @@ class BarrierProblem:
 
     def max_length(self, step: Step) -> float:
         """Largest step length <= 1 that the fraction-to-the-boundary rule permits."""
+        if step.end is not None:  # inside the bounds
+            return 1.0
         tau = self.tau
         length = min(self.x.max_length(step.free, tau), self.s.max_length(step.slack, tau))
         return length if self.elastic is None else min(length, self.elastic.max_length(tau))
@@ -669,10 +728,17 @@ class BarrierProblem:
     def move(self, step: Step, trial: Trial, length: float) -> None:
         """Move to a trial point, and the multipliers along their steps."""
         x, s, mu, tau = self.x, self.s, self.mu, self.tau
-        below_x, above_x, dual_x = x.dual_step(step.free, mu, tau)
-        below_s, above_s, dual_s = s.dual_step(step.slack, mu, tau)
-        # The constraints' multipliers move as far as the variables, those of bounds as far as they can
-        # (eq. 14).
+        if step.end is None:
+            below_x, above_x, dual_x = x.dual_step(step.free, mu, tau)
+            below_s, above_s, dual_s = s.dual_step(step.slack, mu, tau)
+        else:
+            # A QP's multipliers belong to its solution: they move as far as the variables.
+            end_x, end_s = step.end
+            below_x, above_x = end_x.below - x.below, end_x.above - x.above
+            below_s, above_s = end_s.below - s.below, end_s.above - s.above
+            dual_x = dual_s = length
+        # the constraints' multipliers move as far as the variables, those of bounds as far as they can (eq.
+        # 14)
         dual_length, y_length = min(dual_x, dual_s), length
         if self.elastic is not None:
             dual_length = min(dual_length, self.elastic.max_dual_length(step.y, self.y, tau))

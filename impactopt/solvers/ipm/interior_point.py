@@ -67,9 +67,9 @@ class LineSearch:
     held_back : whether the watch shortened the last step much.
     """
 
-    def __init__(self, watch: Watch | None = None) -> None:
-        """watch : limits the length of steps."""
-        self._watch = watch
+    def __init__(self, watch: Watch | None = None, max_growth: float = 1e4) -> None:
+        """watch : limits the length of steps.  max_growth : see `Filter.from_violation`."""
+        self._watch, self._max_growth = watch, max_growth
         self._filter: Filter | None = None
         self._short_steps = 0  # in a row
         self.held_back = False
@@ -91,7 +91,7 @@ class LineSearch:
         start = problem.search_start(step, residual)
         if self._filter is None:
             # Its theta_min and theta_max are relative to the violation where it begins.
-            self._filter = Filter.from_violation(start.theta)
+            self._filter = Filter.from_violation(start.theta, self._max_growth)
         pairs = self._filter
         # A bent step is longer than all that backtracking can find, so it is tried first.
         accepted = _bent_step(problem, pairs, step, start, longest, limit)
@@ -305,7 +305,7 @@ class ElasticPhase:
         return Status.FAILED if met else Status.INFEASIBLE
 
 
-_MAX_MULTIPLIER = 1e12  # larger ones mean that none exist at the iterate
+MAX_MULTIPLIER = 1e12  # larger ones mean that none exist at the iterate
 # From the best iterate, after a failure: with them a strike of the seven-joint arm is solved from all of 20
 # initial guesses.
 _MAX_RESTARTS = 2
@@ -474,14 +474,19 @@ class InteriorRun(Run[IPMOptions]):
         self.report.seconds_qp += self.report.elapsed() - begin
         # Multipliers grow without bound where active gradients become dependent; the
         # price bounds elastic ones.
-        if step is None or np.abs(step.y).max(initial=0.0) > _MAX_MULTIPLIER:
+        if step is None or np.abs(step.y).max(initial=0.0) > MAX_MULTIPLIER:
             return self._leave_stall(residual)
         accepted = self._search.find(problem, step, residual)
         if accepted is None:
             return self._leave_stall(residual)
+        return self._move(accepted)
+
+    def _move(self, accepted: AcceptedStep, *more: str) -> str:
+        """Move to an accepted point; a remark for the history."""
+        problem = self._problem
         problem.move(accepted.step, accepted.trial, accepted.length)
         self.point = problem.point
-        remarks = [f"barrier {problem.mu:.0e}, step {accepted.length:.2g}", *accepted.remarks]
+        remarks = [f"barrier {problem.mu:.0e}, step {accepted.length:.2g}", *more, *accepted.remarks]
         if problem.newton.shift:
             remarks.append(f"shift {problem.newton.shift:.0e}")
         if problem.elastic is not None:

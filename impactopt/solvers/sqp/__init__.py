@@ -1,9 +1,9 @@
-"""Sequential quadratic programming in few variables, with QP solvers."""
+"""Sequential quadratic programming: reduced QPs by QP solvers, large ones by the interior-point method."""
 
 from impactopt.solvers.options import SQPOptions
 from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatus, QuadraticProgram
 from impactopt.solvers.qp.registry import QP_SOLVERS, make_qp_solver
-from impactopt.solvers.sqp.reduced import solve_sqp
+from impactopt.solvers.sqp.solver import solve_sqp
 
 __all__ = [
     "QP_SOLVERS",

@@ -16,14 +16,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from impactopt.solvers.options import SQPOptions
 from impactopt.solvers.program import (
-    Callback,
-    NonlinearProgram,
     Point,
-    SolverResult,
     Status,
     Vector,
     complementarity,
@@ -86,24 +82,6 @@ class Accepted:
     predicted: bool = False
 
 
-def solve_sqp(
-    program: NonlinearProgram,
-    x0: npt.ArrayLike,
-    *,
-    options: SQPOptions | None = None,
-    callback: Callback | None = None,
-    multipliers: npt.ArrayLike | None = None,
-    bound_multipliers: npt.ArrayLike | None = None,
-) -> SolverResult:
-    """Solve a nonlinear program by SQP with exactly solved QPs.
-
-    Parameters, result and errors are those of :func:`impactopt.solvers.ipm.solve_ipm`.
-    options : see `SQPOptions`.
-    """
-    given = program, x0, options or SQPOptions(), callback, multipliers, bound_multipliers
-    return ReducedRun(*given).solve()
-
-
 class ReducedRun(Run[SQPOptions]):
     """One solve. State between iterations: point, multipliers, filter, radius of the QPs, price."""
 
@@ -125,7 +103,8 @@ class ReducedRun(Run[SQPOptions]):
         dense = self.options.hessian == "bfgs"
         self._reduction = Reduction(self.program, guess.jacobian, self.determined, dense=dense)
         self._model = make_model(self.program, self.options, self._reduction)
-        self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
+        name = "osqp" if self.options.qp_solver == "auto" else self.options.qp_solver
+        self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(name))
         try:
             try:
                 self._reduction.load(guess)

@@ -40,7 +40,7 @@ Index = npt.NDArray[np.intp]
 _CACHE_SIZE = 4  # structures
 # Free variables up to which QPs are dense. Beyond, a null space of the remaining equalities would couple all
 # instants of a motion, so they are constraints of a sparse QP.
-_MAX_DENSE = 300
+MAX_DENSE = 300
 _ZERO = 1e-13  # size of an entry that rounding leaves of a zero
 _MIN_RELATIVE_NORM = 1e-6  # of a gradient by the free variables, relative to that by all: less is rounding
 _RANK_TOLERANCE = 1e-9  # relative: an equality with a smaller pivot depends on the others
@@ -90,7 +90,7 @@ class Reduction:
         self.free = np.setdiff1d(np.arange(program.n), self.variables)
         remaining = np.ones(program.m, dtype=bool)
         remaining[self.eliminated] = False
-        self.sparse = not dense and self.free.size > _MAX_DENSE
+        self.sparse = not dense and self.free.size > MAX_DENSE
         by_null_space = remaining & equal & (not self.sparse)
         self.equalities = np.flatnonzero(by_null_space)
         self.others = np.flatnonzero(remaining & ~by_null_space)

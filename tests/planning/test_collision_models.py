@@ -229,7 +229,7 @@ def test_compiling_the_first_model_takes_no_time_from_the_second(monkeypatch: py
         (arm_problem, {"collision": "full"}, {"collision": "sdc", "freezes": 5}),
         (biped_problem, {"collision": "sdc", "freezes": 3}, {"collision": "sdc", "freezes": 2}),
     ],
-    ids=str,
+    ids=lambda given: given.__name__ if callable(given) else " ".join(map(str, given.values())),
 )
 def test_a_warm_start_of_another_model_has_a_contact(
     make: Callable[[], ImpactProblem], before: dict[str, Any], after: dict[str, Any]

@@ -7,7 +7,6 @@ import itertools
 import casadi as ca
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from benchmarks.attempts import judged
 from benchmarks.solve import planning_program, strike_program
 from support.textbook import INF, Textbook, assert_optimal
@@ -88,24 +87,7 @@ def test_large_programs_get_qps_of_the_interior_point_method(monkeypatch: pytest
     assert "barrier" in result.history[-1].note
 
 
-@pytest.mark.parametrize("way", [way for way in WAYS if way != "ipm"])
-def test_matrices_are_sparse_where_many_variables_are_free(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduced_qp_module, "MAX_DENSE", 1)
-    program = chain()
-    result = solve_sqp(program, [0.5, 0.0, 0.0, 0.5], options=WAYS[way])
-    assert result.status is Status.SOLVED
-    assert_optimal(program, result)
-    point = TimedProgram(program).point(result.x)
-    reduction = Reduction(TimedProgram(program), point.jacobian, Chain.determined)
-    reduction.load(point)
-    assert sp.issparse(reduction.T)
-    assert reduction.T.shape == (4, 2)  # the remaining equality is a constraint of the QP
-    assert not reduction.equalities.size
-    np.testing.assert_allclose((point.jacobian @ reduction.T).toarray()[:2], 0, atol=1e-12)
-
-
-def test_a_hessian_that_is_not_convex_is_lifted_and_stays_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduced_qp_module, "MAX_DENSE", 1)
+def test_a_hessian_that_is_not_convex_is_lifted() -> None:
     bent = Chain(
         4,
         lambda a, b, c, d: ca.cos(3 * a) - 2 * (d - 0.2) ** 2 + c,
@@ -130,7 +112,7 @@ def test_quasi_newton_steps_learn_how_the_equalities_bend() -> None:
     timed, multiplier = TimedProgram(circle), 50.0
     angles = (0.40, 0.41)
     points = [timed.point(np.array([np.cos(x), np.cos(x), np.cos(x), np.sin(x)])) for x in angles]
-    reduction = Reduction(timed, points[0].jacobian, Chain.determined, dense=True)
+    reduction = Reduction(timed, points[0].jacobian, Chain.determined)
     rule, y = make_model(timed, WAYS["bfgs"], reduction), np.array([0.0, 0.0, multiplier])
     for point in points:
         reduction.load(point)
@@ -152,7 +134,7 @@ def test_a_kink_is_no_curvature_to_learn() -> None:
     points = [
         timed.point(np.array([a, np.sin(a), np.sin(a) ** 2 + a, 0.5])) for a in (0.3 - 1e-6, 0.3 + 1e-6)
     ]
-    reduction = Reduction(timed, points[0].jacobian, Chain.determined, dense=True)
+    reduction = Reduction(timed, points[0].jacobian, Chain.determined)
     rule, learned = make_model(timed, WAYS["bfgs"], reduction), []
     for point in points:
         reduction.load(point)

@@ -99,9 +99,7 @@ class ReducedRun(Run[SQPOptions]):
         if not self.point.differentiable:
             return Status.FAILED
         guess, y, z = self.point, self.y.copy(), self.z.copy()
-        # BFGS learns one dense matrix of the free variables, so its QPs are dense, too.
-        dense = self.options.hessian == "bfgs"
-        self._reduction = Reduction(self.program, guess.jacobian, self.determined, dense=dense)
+        self._reduction = Reduction(self.program, guess.jacobian, self.determined)
         self._model = make_model(self.program, self.options, self._reduction)
         name = "osqp" if self.options.qp_solver == "auto" else self.options.qp_solver
         self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(name))

@@ -38,10 +38,6 @@ from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatu
 
 Index = npt.NDArray[np.intp]
 _CACHE_SIZE = 4  # structures
-# Free variables up to which QPs are dense. Beyond, a null space of the remaining equalities would couple all
-# instants of a motion, so they are constraints of a sparse QP.
-MAX_DENSE = 300
-_ZERO = 1e-13  # size of an entry that rounding leaves of a zero
 _MIN_RELATIVE_NORM = 1e-6  # of a gradient by the free variables, relative to that by all: less is rounding
 _RANK_TOLERANCE = 1e-9  # relative: an equality with a smaller pivot depends on the others
 
@@ -52,22 +48,15 @@ class Reduction:
     Attributes
     ----------
     eliminated, variables : equalities that are eliminated, and the variables that they determine.
-    free : the other variables.  sparse : whether there are more than a dense QP takes.
-    equalities : those that remain; none if it is sparse.  others : all other constraints.
+    free : the other variables.
+    equalities : those that remain.  others : the inequalities.
     bounded : variables with a bound, free or not.
-    T : (n, r) a basis, as columns, of the steps of all variables that keep all equalities but those in
-        `others`; r is the number of variables of the QPs; sparse or dense.
+    T : (n, r) a basis, as columns, of the steps of all variables that keep the equalities; r is the number of
+        variables of the QPs.
     """
 
-    def __init__(
-        self,
-        program: TimedProgram,
-        jacobian: Matrix,
-        determined: Sequence[Determined],
-        *,
-        dense: bool = False,
-    ):
-        """jacobian : (m, n) csc, at any point.  dense : even if many variables are free."""
+    def __init__(self, program: TimedProgram, jacobian: Matrix, determined: Sequence[Determined]):
+        """jacobian : (m, n) csc, at any point."""
         equal = program.g_lower == program.g_upper
         self._equations, all_equal = np.flatnonzero(equal), np.ones(int(equal.sum()), dtype=bool)
         # The condenser sees equalities only; the QP has the inequalities, and the Hessian is projected by T.
@@ -90,10 +79,8 @@ class Reduction:
         self.free = np.setdiff1d(np.arange(program.n), self.variables)
         remaining = np.ones(program.m, dtype=bool)
         remaining[self.eliminated] = False
-        self.sparse = not dense and self.free.size > MAX_DENSE
-        by_null_space = remaining & equal & (not self.sparse)
-        self.equalities = np.flatnonzero(by_null_space)
-        self.others = np.flatnonzero(remaining & ~by_null_space)
+        self.equalities = np.flatnonzero(remaining & equal)
+        self.others = np.flatnonzero(~equal)
         self.bounded = np.flatnonzero(np.isfinite(program.x_lower) | np.isfinite(program.x_upper))
         self._n = program.n
 
@@ -113,11 +100,10 @@ class Reduction:
         equations = self._of_equations(point.jacobian_csr)
         self._A = point.jacobian_csr[self.equalities]
         self._condenser.load(equations, self._empty)
-        Z = np.zeros((self._n, self.free.size))
+        Z = self._Z = np.zeros((self._n, self.free.size))
         # The identity for free variables; the rows of the determined ones become -A_D^-1 A_F.
         Z[self.free, np.arange(self.free.size)] = 1.0
         self._condenser.expand_basis(Z)
-        Z = self._Z = _without_zeros(Z) if self.sparse else Z
         A = self._A @ Z
         if not self.equalities.size:
             self._Y, self._R, self._order = np.zeros((self.free.size, 0)), np.zeros((0, 0)), self.equalities
@@ -198,36 +184,29 @@ def _key(equations: Matrix, determined: Sequence[Determined]) -> bytes:
     return digest.digest()
 
 
-def _without_zeros(Z: np.ndarray) -> Matrix:
-    i, j = np.nonzero(np.abs(Z) > _ZERO)
-    return sp.csr_array((Z[i, j], (i, j)), shape=Z.shape)
-
-
 _MIN_EIGENVALUE = 1e-5  # of a convex Hessian
 # Weights of active constraints that are tried to make the Hessian convex: they change no step along these
 # constraints, while lifted eigenvalues do.
 _ACTIVE_WEIGHTS = (0.0, 10.0, 1e2, 1e3, 1e4)
-_MIN_SHIFT = 1e-4  # of a sparse Hessian that is not convex with a weight
 _INITIAL_CURVATURE = 1e-2  # of BFGS
 _MIN_BFGS_EIGENVALUE = 1e-3
 _MAX_CURVATURE = 1e4  # that BFGS learns: more is a kink between two points
 _RESTORATION_CURVATURE = 0.1  # of the model whose QP reduces the violation alone
-Active = Callable[[], Matrix]
+Active = Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True)
 class ReducedModel:
     """Model gradient . d + 1/2 t'Bt of a step d = d0 + T t, with B (r, r) positive definite.
 
-    T (n, r), TH (r, n) : T and T'H with the Hessian H; None: H is zero. They and B are dense or sparse, as
-    the reduction is.
+    T (n, r), TH (r, n) : T and T'H with the Hessian H; None: H is zero.
     has_objective : False if it is for the violation alone.
     """
 
-    B: Matrix
+    B: np.ndarray
     gradient: Vector
-    T: Matrix
-    TH: Matrix | None
+    T: np.ndarray
+    TH: np.ndarray | None
     has_objective: bool = True
 
     def slope(self, d0: Vector) -> Vector:
@@ -253,11 +232,10 @@ class ModelRule(Protocol):
 
 
 class ExactModel:
-    """Exact reduced Hessian, made convex by weights of active constraints, a shift or lifted eigenvalues."""
+    """Exact reduced Hessian, made convex by a weight of active constraints or lifted eigenvalues."""
 
     def __init__(self, program: TimedProgram, reduction: Reduction):
         self._program, self._reduction = program, reduction
-        self._shift = 0.0
 
     def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
         T = self._reduction.T
@@ -265,25 +243,10 @@ class ExactModel:
             return _restoration_model(point, T)
         TH = T.T @ self._program.hessian(point.x, 1.0, y)
         B = TH @ T
-        convex = self._shifted if self._reduction.sparse else _convex
-        return ReducedModel(convex(0.5 * (B + B.T), active()), point.gradient, T, TH)
+        return ReducedModel(_convex(0.5 * (B + B.T), active()), point.gradient, T, TH)
 
     def forget(self) -> None:
-        self._shift = 0.0
-
-    def _shifted(self, B: Matrix, active: Matrix) -> Matrix:
-        """Sparse B made convex by a weight of active constraints and, if necessary, a shift."""
-        square, identity = active.T @ active, sp.eye_array(B.shape[0], format="csc")
-        for weight in _ACTIVE_WEIGHTS[:2]:
-            if _is_convex(weighted := B + weight * square):
-                # As in the interior-point method the last shift is where the next
-                # search begins, and it decays.
-                self._shift /= 3.0
-                return weighted
-        self._shift = max(self._shift / 3.0, _MIN_SHIFT)
-        while not _is_convex(shifted := weighted + self._shift * identity):
-            self._shift *= 4.0
-        return shifted
+        pass
 
 
 class BFGSModel:
@@ -343,16 +306,8 @@ class BFGSModel:
         self._B = self._B - np.outer(Bs, Bs) / sBs + np.outer(r, r) / float(step @ r)
 
 
-def _is_convex(B: Matrix) -> bool:
-    try:
-        la.cholesky(B.toarray() - _MIN_EIGENVALUE * np.eye(B.shape[0]), overwrite_a=True, check_finite=False)
-    except la.LinAlgError:
-        return False
-    return True
-
-
 def _convex(B: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Dense B made convex by the least sufficient weight of active constraints, or by lifted eigenvalues."""
+    """B made convex by the least sufficient weight of active constraints, or by lifted eigenvalues."""
     square, least = active.T @ active, _MIN_EIGENVALUE * np.eye(len(B))
     for weight in _ACTIVE_WEIGHTS if len(active) else _ACTIVE_WEIGHTS[:1]:
         weighted = B + weight * square
@@ -364,11 +319,9 @@ def _convex(B: np.ndarray, active: np.ndarray) -> np.ndarray:
     return np.asarray((vectors * np.maximum(values, _MIN_EIGENVALUE)) @ vectors.T)
 
 
-def _restoration_model(point: Point, T: Matrix) -> ReducedModel:
+def _restoration_model(point: Point, T: np.ndarray) -> ReducedModel:
     # Without curvature the QP may have many solutions; the dual method needs a positive definite P.
-    B = _RESTORATION_CURVATURE * (
-        sp.eye_array(T.shape[1], format="csc") if sp.issparse(T) else np.eye(T.shape[1])
-    )
+    B = _RESTORATION_CURVATURE * np.eye(T.shape[1])
     return ReducedModel(B, np.zeros_like(point.gradient), T, None, has_objective=False)
 
 
@@ -431,7 +384,7 @@ class ReducedQP:
         # multipliers of the normalized constraints; of a guess, whose scale is unknown, those of the program
         self._unit = np.concatenate([y[reduction.others], z[reduction.bounded]])
 
-    def active(self, point: Point) -> Matrix:
+    def active(self, point: Point) -> np.ndarray:
         """Gradients (a, r), along T, of the constraints that were active in the last QP.
 
         Their norms by all variables are 1: along T they may be small, so that the model's curvature does not
@@ -440,7 +393,7 @@ class ReducedQP:
         every, which = self._gradients(point), np.flatnonzero(np.abs(self._unit) > _ACTIVE_MULTIPLIER)
         # Rows of `every` have norm 1 by the free variables; times this, 1 by all variables.
         own = self._norms / point.row_norms[self._reduction.others]
-        return sp.diags_array(np.append(own, np.ones(every.shape[0] - own.size))[which]) @ every[which]
+        return np.append(own, np.ones(len(every) - own.size))[which, None] * every[which]
 
     def weigh(self, point: Point, y: Vector, price: float) -> None:
         """Set the weights of constraints in the merit function, so that one price suits all.
@@ -458,16 +411,13 @@ class ReducedQP:
         known = _PRICE_MARGIN * np.abs(y[others]) / price
         weights[others] = np.maximum(np.maximum(weights[others], by_free), known)
 
-    def _gradients(self, point: Point) -> Matrix:
+    def _gradients(self, point: Point) -> np.ndarray:
         """Gradients (k, r) along T of the normalized constraints: `others`, then the bounds."""
         if self._at is not point:
             reduction = self._reduction
             own, self._norms = reduction.reduced_jacobian(point)
             bounds, self._at = reduction.T[reduction.bounded], point
-            if reduction.sparse:
-                self._every = sp.vstack([sp.diags_array(1.0 / self._norms) @ own, bounds], "csr")
-            else:
-                self._every = np.vstack([own / self._norms[:, None], bounds])
+            self._every = np.vstack([own / self._norms[:, None], bounds])
         return self._every
 
     def solve(
@@ -569,7 +519,7 @@ def _no_variables(qp: QuadraticProgram) -> QPSolution:
 
 
 def _elastic_qp(
-    B: Matrix, c: Vector, A: Matrix, lower: Vector, upper: Vector, radius: float, prices: Vector
+    B: np.ndarray, c: Vector, A: np.ndarray, lower: Vector, upper: Vector, radius: float, prices: Vector
 ) -> QuadraticProgram:
     """QP in (t, s), |t| <= radius: A t + s >= lower where t = 0 is below, A t - s <= upper where it is above.
 
@@ -579,22 +529,17 @@ def _elastic_qp(
     elastic = np.concatenate([below, above])
     k, n = elastic.size, c.size
     box = np.full(n, radius)
-    dense = isinstance(A, np.ndarray)
     if k:
         sign = np.where(np.arange(k) < below.size, 1.0, -1.0)
         curvature = _SLACK_CURVATURE * prices[elastic]
         c = np.concatenate([c, prices[elastic]])
-        if dense:
-            S = np.zeros((lower.size, k))
-            S[elastic, np.arange(k)] = sign
-            A, B = np.hstack([A, S]), la.block_diag(B, np.diag(curvature))
-        else:
-            S = sp.csc_array((sign, (elastic, np.arange(k))), shape=(lower.size, k))
-            A, B = sp.hstack([sp.csc_array(A), S]), sp.block_diag([B, sp.diags_array(curvature)])
+        S = np.zeros((lower.size, k))
+        S[elastic, np.arange(k)] = sign
+        A, B = np.hstack([A, S]), la.block_diag(B, np.diag(curvature))
     return QuadraticProgram(
-        P=B if dense else sp.csc_array(B),
+        P=B,
         q=c,
-        A=A if dense else sp.csc_array(A),
+        A=A,
         lower=lower,
         upper=upper,
         x_lower=np.concatenate([-box, np.zeros(k)]),

@@ -9,7 +9,10 @@ from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult
 from impactopt.solvers.run import BarrierState, Watch
 from impactopt.solvers.sqp.interior_qp import InteriorQPRun, interior_options
 from impactopt.solvers.sqp.reduced import ReducedRun
-from impactopt.solvers.sqp.reduced_qp import MAX_DENSE
+
+# Free variables up to which "auto" reduces the QPs to these: a reduced QP is dense, as the null space of the
+# equalities couples all instants of a motion.
+MAX_DENSE = 300
 
 
 def solve_sqp(

@@ -21,6 +21,7 @@ from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, SQPOptions, make_qp_solv
 EXACT = {"tol": 1e-9, "bound_relax_factor": 0.0}
 # for six digits of an objective however many bounds hold
 SHARP = IPMOptions(complementarity_tolerance=1e-8)
+SHARP_SQP = SQPOptions(qp_solver="ipm", kkt_tolerance=1e-8)
 WAYS = {"default": IPMOptions(), "osqp": SQPOptions(qp_solver="osqp"), "sqp_ipm": SQPOptions(qp_solver="ipm")}
 
 
@@ -43,10 +44,11 @@ def test_the_books_optima_are_optima(name):
 
 
 @pytest.mark.parametrize("name", [name for name in BOOK if name not in OUT_OF_SCALE])
-def test_the_sqp_finds_the_books_optima(name):
+@pytest.mark.parametrize("options", [SHARP, SHARP_SQP], ids=["ipm", "sqp_ipm"])
+def test_the_books_optima_are_found(name, options):
     case = BOOK[name]
     program = case.build()
-    result = solve_ipm(program, case.x0, options=SHARP)
+    result = solve_by(program, case.x0, options)
     assert result.status is Status.SOLVED
     assert result.objective == pytest.approx(case.optimum, rel=1e-5, abs=1e-5)
     assert_optimal(program, result)

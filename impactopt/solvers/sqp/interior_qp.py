@@ -34,7 +34,8 @@ def interior_options(options: SQPOptions) -> IPMOptions:
     """Options of the interior-point method with those that all solvers have."""
     shared = {field.name: getattr(options, field.name) for field in fields(SolverOptions)}
     # Corrections of refused steps are for Newton steps: the QP's matrix is factored elsewhere.
-    return IPMOptions(**{**shared, "second_order_correction": False})
+    shared |= {"second_order_correction": False, "complementarity_tolerance": options.kkt_tolerance}
+    return IPMOptions(**shared)
 
 
 class InteriorQPRun(InteriorRun):

@@ -85,7 +85,8 @@ class Spent:
 class Budget:
     """Solver with its options, and the time limit [s] of all its calls together; None: no limit.
 
-    The option `max_iterations`, if it is given, is the limit of all calls from one start together.
+    The option `max_iterations`, if it is given, is the limit of all calls from one start together, or of each
+    call if they are not `together`.
 
     callback : called with each iteration's record; True stops the solver.
     report : called with lines of text.
@@ -106,6 +107,7 @@ class Budget:
     since: float = field(default_factory=time.perf_counter)
     stop: Stop = field(default_factory=Stop)
     spent: Spent = field(default_factory=Spent)
+    together: bool = True
 
     def __post_init__(self) -> None:
         check_choice("unknown solver", self.solver, SOLVERS)
@@ -153,8 +155,8 @@ class Budget:
 
     @property
     def iterations_left(self) -> int | None:
-        """Remaining iterations; None without a given limit."""
-        given = (self.options or {}).get("max_iterations")
+        """Remaining iterations of all calls together; None without such a limit."""
+        given = (self.options or {}).get("max_iterations") if self.together else None
         return None if given is None else max(int(given) - self.spent.iterations, 0)
 
     def is_over(self) -> bool:
@@ -186,7 +188,7 @@ class Budget:
         start : initial guess (n,); or a similar program's result for a warm start, whose multipliers our
         solvers use too.
         barrier : first one of "ipm" for a warm start, if that is farther from the solution than it seems.
-        most : largest number of iterations of our solvers, unless the options set that of all calls.
+        most : largest number of iterations of our solvers, unless the options set it.
         watch, state : as of `solve_ipm`.
         """
         # After a stop the callback ends the solve at its first iterate; a limit of no
@@ -204,7 +206,7 @@ class Budget:
         if self.iterations_left is not None:
             settings["max_iterations"] = self.iterations_left
         elif most is not None:
-            settings["max_iterations"] = most
+            settings.setdefault("max_iterations", most)
         if left is not None:
             # The options refuse 0.
             settings["time_limit"] = max(left, 1e-9)

@@ -54,7 +54,7 @@ from impactopt.transcription.transcription import Transcription, statement_of
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
-_HOPELESS_ITERATIONS = 100  # of each start of a problem that is unlikely to have a solution
+_HOPELESS_ITERATIONS = 100  # of each program of a problem that is unlikely to have a solution
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 
 
@@ -315,7 +315,7 @@ def _best(
     budget, options = solver.budget, solver.budget.options or {}
     if not doubted or budget.solver == "ipopt" or "max_iterations" in options:
         return best_of(guesses(solver), solver.from_guess, budget, count)
-    few = replace(budget, options={**options, "max_iterations": _HOPELESS_ITERATIONS})
+    few = replace(budget, options={**options, "max_iterations": _HOPELESS_ITERATIONS}, together=False)
     quick = replace(solver, budget=few)
     outcome = best_of(guesses(quick), quick.from_guess, few, count)
     program, result = outcome.program, outcome.result

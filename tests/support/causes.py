@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from impactopt import ImpactProblem
 from impactopt.planning.budget import Budget
 from impactopt.planning.causes import Search, search
@@ -15,6 +17,6 @@ ITERATIONS = 20  # the search needs a point with violations, not the least ones
 def searched(problem: ImpactProblem) -> tuple[Transcription, SolverResult, Search]:
     """Program of a problem, the result of a short solve of it, and the causes found from there."""
     t = Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
-    budget = Budget(solver="ipm", options={"max_iterations": ITERATIONS}, time_limit=None, callback=None)
-    result = budget.run(t.program, first_iterate(t))
-    return t, result, search(t, result, budget)
+    few = Budget(solver="ipm", options={"max_iterations": ITERATIONS}, time_limit=None, callback=None)
+    result = few.run(t.program, first_iterate(t))
+    return t, result, search(t, result, replace(few, options=None))

@@ -13,11 +13,12 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.small_plans import changed, transcribed
-from support.textbook import CASES, INF, Textbook, assert_optimal
+from support.textbook import CASES, INF, Textbook, assert_optimal, solve_by
 
 from impactopt import InputError, Status, load_problem
 from impactopt.solvers.ipm import IPMOptions, interior_point, solve_ipm
 from impactopt.solvers.program import Determined, max_violation
+from impactopt.solvers.sqp import SQPOptions
 from impactopt.transcription.initial_guess import first_iterate
 
 
@@ -179,8 +180,9 @@ def test_a_loose_stationarity_leaves_constraints_met(name):
     assert max_violation(program, result.x, program.constraints(result.x)) <= 1e-7
 
 
+@pytest.mark.parametrize("options", [IPMOptions(), SQPOptions(qp_solver="ipm")], ids=["ipm", "sqp_ipm"])
 @pytest.mark.parametrize("bad", ["raises", "is nan"])
-def test_a_hessian_that_cannot_be_computed_is_a_failure(bad):
+def test_a_hessian_that_cannot_be_computed_is_a_failure(bad, options):
     class Bad(Textbook):
         def hessian(self, x, sigma, multipliers):
             found = super().hessian(x, sigma, multipliers)
@@ -193,7 +195,7 @@ def test_a_hessian_that_cannot_be_computed_is_a_failure(bad):
     case = CASES["HS71"]
     program = case.build()
     program.__class__ = Bad
-    result = solve_ipm(program, case.x0)
+    result = solve_by(program, case.x0, options)
     assert result.status is Status.FAILED
     assert np.isfinite(result.x).all()
 

@@ -396,13 +396,13 @@ class QuadraticModel:
     The Hessian is that of the Lagrangian, and the constraints are linearized.
     """
 
-    def __init__(self, program: TimedProgram, at: Point, multipliers: Vector):
-        """multipliers : of the constraints (m,), in the Lagrangian."""
+    def __init__(self, program: TimedProgram, at: Point, hessian: Matrix):
+        """hessian (n, n) : of the Lagrangian at the point."""
         self.n, self.m = program.n, program.m
         self.x_lower, self.x_upper = program.x_lower, program.x_upper
         self.g_lower, self.g_upper = program.g_lower, program.g_upper
         self.constraint_name, self.variable_name = program.constraint_name, program.variable_name
-        self._at, self._hessian = at, program.hessian(at.x, 1.0, multipliers)
+        self._at, self._hessian = at, hessian
 
     def objective(self, x: Vector) -> float:
         d = x - self._at.x
@@ -601,13 +601,19 @@ class BarrierProblem:
         # multipliers follow from the next step.
         self.y, self.eliminated_y = self.elastic.clip(self.y), np.zeros_like(self.eliminated_y)
 
+    def _hessian(self, sigma: float) -> Matrix | None:
+        """Hessian of the Lagrangian at the iterate; None if it cannot be computed."""
+        try:
+            return self.program.hessian(self.point.x, sigma, self.constraint_multipliers)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            return None
+
     # ------------------------------------------------------------------ Newton step
     def step(self, residual: Vector) -> Step | None:
         """Newton step; None if the Hessian cannot be computed, or the matrix not be factored."""
         point, hard = self.point, self.elastic is None
-        try:
-            hessian = self.program.hessian(point.x, self.sigma, self.constraint_multipliers)
-        except (ArithmeticError, np.linalg.LinAlgError):
+        hessian = self._hessian(self.sigma)
+        if hessian is None:
             return None
         factored = self.newton.factor(
             point.jacobian,
@@ -653,14 +659,16 @@ class BarrierProblem:
         return Step(d, d[c.free], slack, y, of_all[c.eliminated])
 
     # ------------------------------------------------------------------ quadratic model
-    def quadratic(self) -> BarrierProblem:
+    def quadratic(self) -> BarrierProblem | None:
         """Barrier problem of the QP at the iterate: the program's quadratic model, linearized constraints.
 
-        It begins at the iterate, and shares the Newton system.
+        It begins at the iterate, and shares the Newton system. None if the Hessian cannot be computed.
         """
-        model = QuadraticModel(self.program, self.point, self.constraint_multipliers)
+        hessian = self._hessian(1.0)
+        if hessian is None:
+            return None
         out = copy.copy(self)
-        out.program = TimedProgram(model)
+        out.program = TimedProgram(QuadraticModel(self.program, self.point, hessian))
         out.point = out.program.point(self.point.x)
         out.x, out.s = copy.copy(self.x), copy.copy(self.s)
         return out

@@ -54,15 +54,17 @@ class InteriorQPRun(InteriorRun):
             begin = self.report.elapsed()
             step, taken = _solve_qp(problem)
             self.report.seconds_qp += self.report.elapsed() - begin
-            accepted = self._search.find(problem, step, residual) if taken else None
+            accepted = None if step is None else self._search.find(problem, step, residual)
             if accepted is not None:
                 return self._move(accepted, f"QP {taken}")
         return super()._advance(residual)
 
 
-def _solve_qp(problem: BarrierProblem) -> tuple[Step, int]:
-    """Step to the solution of the QP's barrier problem, and the number of Newton steps it took."""
+def _solve_qp(problem: BarrierProblem) -> tuple[Step | None, int]:
+    """Step to the solution of the QP's barrier problem, None without; and the Newton steps that it took."""
     qp, search, taken = problem.quadratic(), LineSearch(), 0
+    if qp is None:
+        return None, taken
     while taken < _MAX_NEWTON_STEPS:
         residual = qp.residual(qp.point, qp.s.values)
         qp.update_multipliers()
@@ -78,4 +80,4 @@ def _solve_qp(problem: BarrierProblem) -> tuple[Step, int]:
         taken += 1
         if np.abs(qp.point.x - problem.point.x).max() > _MAX_STEP:
             break
-    return problem.step_to(qp), taken
+    return problem.step_to(qp) if taken else None, taken

@@ -89,8 +89,8 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation
     chosen = _sampled(time, simulation.q, simulation.travel())
     phase = np.full(len(time), MISSED) if simulation.missed else simulation.phase()
     bodies = problem.bodies
-    aside = simulation.target_aside[chosen] if len(simulation.target_aside) else None
-    at = Places.of(problem.robot, simulation.q[chosen], simulation.travel()[chosen], phase[chosen], aside)
+    travel, aside = simulation.travel()[chosen], simulation.aside()[chosen]
+    at = Places.of(problem.robot, simulation.q[chosen], travel, phase[chosen], aside)
     survey = bodies.survey(time[chosen], at)
     touched = simulation.touched
     if simulation.fall is None or not problem.keeps_apart:  # the engine had no solids that collide

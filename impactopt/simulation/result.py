@@ -242,6 +242,10 @@ class Simulation:
         """Travel (k,) [m] of the target along its normal since contact began."""
         return travelled(self.time, self.target_speed, self.contact_start)
 
+    def aside(self) -> Array:
+        """Displacement (k, 3) [m] of the target across its normal; zero if friction does not move it."""
+        return self.target_aside if len(self.target_aside) else np.zeros((len(self.time), 3))
+
     def phase(self) -> NDArray[np.intp]:
         """Phase (k,) by the contact that happened: 0 swing, 1 collision, 2 follow-through."""
         start = self.contact_start if np.isfinite(self.contact_start) else np.inf

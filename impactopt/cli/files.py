@@ -157,8 +157,8 @@ def _draft(
     from rich.console import Console
 
     from impactopt.errors import printable
-    from impactopt.files.draft.description import find_description
     from impactopt.files.draft.drafting import draft_problem
+    from impactopt.files.draft.robot import find_description
     from impactopt.report.console import SolveConsole
 
     path = Path(given) if mjcf else find_description(given)

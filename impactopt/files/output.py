@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.codegen.files import write_atomically
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_kind
 from impactopt.files.problem_file.reading import change_data
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.record import (
@@ -36,6 +36,7 @@ from impactopt.files.toml import read_toml, write_toml
 from impactopt.kinematics.support import corners_at, support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
+from impactopt.simulation.result import Simulation
 from impactopt.solvers.program import SolverResult, Status
 
 if TYPE_CHECKING:  # reading a record does not import the planner
@@ -61,8 +62,8 @@ DERIVED = (
 def record_of(
     solution: Solution,
     *,
-    simulation: Any | None = None,
-    replay: Any | None = None,
+    simulation: Simulation | None = None,
+    replay: Simulation | None = None,
     problem: str = "",
     problem_path: Path | None = None,
 ) -> Record:
@@ -70,7 +71,14 @@ def record_of(
 
     A solver that is stopped early may leave legs and base that do not fit together. Then the record has no
     `reference_*`, and its summary no numbers of the motion, but a `note` with the reason.
+
+    Raises
+    ------
+    InputError : a simulation or a replay that is no `Simulation`.
     """
+    for name, given in (("simulation", simulation), ("replay", replay)):
+        if given is not None:
+            check_kind(name, given, Simulation)
     plan, robot, result = solution.plan, solution.problem.robot, solution.result
     arrays = _scene_arrays(solution.problem)
     parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_choice, check_positive
+from impactopt.errors import InputError, check_choice, check_positive, shortened
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.options import OPTIONS
@@ -95,8 +95,8 @@ class Budget:
 
     Raises
     ------
-    InputError : an unknown solver; a time limit that is not positive; unknown options of our solvers (IPOPT
-        checks its own when it starts).
+    InputError : an unknown solver; a time limit that is not positive; a callback or report that is no
+        function; unknown options of our solvers (IPOPT checks its own when it starts).
     """
 
     solver: str
@@ -113,6 +113,9 @@ class Budget:
         check_choice("unknown solver", self.solver, SOLVERS)
         if self.time_limit is not None:
             check_positive("time_limit [s]", self.time_limit)
+        for name, given in (("callback", self.callback), ("report", self.report)):
+            if given is not None and not callable(given):
+                raise InputError(f"{name} must be a function, not {shortened(repr(given))}")
         if self.options is None:
             return
         if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):

@@ -51,6 +51,35 @@ _FAR_BEYOND = 2.0
 _TEST_FRACTION, _TEST_SPEED = 0.5, 1.0
 
 
+def check_start(start: Solved, problem: ImpactProblem, *, motion: bool) -> None:
+    """Check that a problem's program can start from a solution.
+
+    motion : whether it is the program of a whole motion, which has an abort motion for missed targets.
+
+    Raises
+    ------
+    InputError : the solution is of another robot, or its program has collisions or an abort motion for other
+        scenarios.
+    """
+    old = start.problem
+    if old.robot.joint_names != problem.robot.joint_names:
+        raise InputError(
+            f"start: a solution of the robot {old.robot.name!r}, and the problem's is "
+            f"{problem.robot.name!r}; give one of the same robot"
+        )
+    # Numbers of a scenario's target and law are parameters of the program: they may differ.
+    parts = [
+        (sum(not s.missing for s in p.scenarios), motion and p.abort_after is not None)
+        for p in (old, problem)
+    ]
+    if parts[0] != parts[1]:
+        has, wanted = (", ".join(s.name for s in p.scenarios) or "none" for p in (old, problem))
+        raise InputError(
+            f"start: the scenarios of the solution are {has}, those of the problem {wanted}, and each has "
+            "variables of its own: give a solution with as many scenarios, or leave start out"
+        )
+
+
 def carried_start(
     t: ContactProgram, old: Callable[[], ContactProgram], start: Solved, constraints: Any
 ) -> SolverResult:

@@ -30,7 +30,7 @@ from impactopt.planning.lazy_constraints import (
     window_caution,
     with_lazy_constraints,
 )
-from impactopt.planning.models import carried_start, overloaded, with_order, with_order_of
+from impactopt.planning.models import carried_start, check_start, overloaded, with_order, with_order_of
 from impactopt.planning.motion_price import MotionPrice, with_first_scale
 from impactopt.planning.multistart import (
     Guesses,
@@ -211,11 +211,7 @@ def _program(
         if isinstance(start, str):
             return with_first_scale(t), start
         return t, check_array("start", start, (t.program.n,))
-    if start.problem.robot.joint_names != problem.robot.joint_names:
-        raise InputError(
-            f"start: a solution of the robot {start.problem.robot.name!r}, and the problem's is "
-            f"{problem.robot.name!r}; give one of the same robot"
-        )
+    check_start(start, problem, motion=True)
     # a similar problem is likely to need the same lazy constraints and prices
     problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
     if problem.style == start.problem.style:

@@ -17,7 +17,7 @@ from impactopt.planning.clearance_constraints import Margins, deepest_penetratio
 from impactopt.planning.diagnosis import with_reason
 from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
 from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, lazy_terms_of, with_lazy_constraints
-from impactopt.planning.models import carried_start, with_order, with_order_of
+from impactopt.planning.models import carried_start, check_start, with_order, with_order_of
 from impactopt.planning.multistart import (
     Guesses,
     best_of,
@@ -135,6 +135,7 @@ def _optimized(
     """Best strike from the starts of these numbers, or from the given initial guess."""
     began, problem = time.perf_counter(), with_room_for_gains(problem)
     if isinstance(start, StrikeSolution):
+        check_start(start, problem, motion=False)
         problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
         problem = with_order_of(start, problem)
     else:

@@ -54,7 +54,7 @@ def animate(solution: Solution, *, simulation: Any | None = None, replay: Any | 
 
     Raises
     ------
-    InputError : the solve ended before there was a motion.
+    InputError : the solve ended before there was a motion; a simulation of another type.
     """
     record = record_of(solution, simulation=simulation, replay=replay)
     return animation_of(record, solution.problem)

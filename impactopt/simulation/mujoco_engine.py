@@ -20,15 +20,17 @@ from impactopt.robots.loads import MIN_LOAD_FRACTION, weight_of
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import UnintendedContacts
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
-from impactopt.simulation.link_contact import CONTACTS, LinkContact, solids_in_contact
 from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors, Servo
 from impactopt.simulation.mujoco_world import (
+    CONTACTS,
+    LinkContact,
     MujocoOptions,
     MujocoRobot,
     Welds,
     build_world,
     no_log_file,
     site_name,
+    solids_in_contact,
 )
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import (

@@ -37,9 +37,8 @@ from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.visuals import visuals_of
 from impactopt.cli.app import app
 from impactopt.files.draft.default_drives import guess_drives
-from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
-from impactopt.files.draft.robot import Drafted, draft_robot
+from impactopt.files.draft.robot import Drafted, draft_robot, find_description
 from impactopt.files.draft.soles import sides
 from impactopt.files.draft.strikers import find_striker
 from impactopt.files.toml import read_toml

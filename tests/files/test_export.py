@@ -49,7 +49,7 @@ from impactopt.cli.app import app
 from impactopt.cli.export import Target as Choice
 from impactopt.contact.laws import LAWS
 from impactopt.files.export import FORMATS, export_planned
-from impactopt.files.export import player as formulas
+from impactopt.files.export import mujoco_scene as formulas
 from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
 from impactopt.files.replay import Planned

@@ -94,6 +94,13 @@ def test_without_any_solution_it_says_so(arm: ImpactProblem, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("plan", [optimize_strike, solve])
+@pytest.mark.parametrize("name", ["callback", "report"])
+def test_callbacks_are_functions(plan: Any, arm: ImpactProblem, name: str) -> None:
+    with pytest.raises(InputError, match=f"{name} must be a function, not 3"):
+        plan(arm, **{name: 3})
+
+
+@pytest.mark.parametrize("plan", [optimize_strike, solve])
 def test_bad_numbers_of_processes_are_refused(plan: Any, arm: ImpactProblem) -> None:
     for workers in (0, 1.5, True):
         with pytest.raises(InputError, match="workers"):

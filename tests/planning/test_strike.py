@@ -447,6 +447,24 @@ def test_a_start_that_is_none_is_refused(
         solve(arm_transcription.problem, start=np.zeros(3))
 
 
+@pytest.mark.parametrize("plan", [solve, optimize_strike])
+def test_a_start_with_other_scenarios_is_refused(plan: Any, arm_plan: Planned) -> None:
+    """Their collisions have variables, which a solution without them lacks; of a strike, a missed target has
+    none.
+    """
+    solved: dict[str, Any] = {"problem": arm_plan.problem, "result": arm_plan.result, "solver": "ipm"}
+    solved |= {"build_seconds": 0.0, "solve_seconds": 0.0, "violations": ()}
+    start: Any = Solution(plan=arm_plan.plan, **solved)
+    if plan is optimize_strike:
+        start = StrikeSolution(strike=arm_plan.plan, **solved)
+    others = [(Scenario(name="heavy", mass=2.0),), (Scenario(name="gone", missing=True, abort_after=0.02),)]
+    for scenarios in others if plan is solve else others[:1]:
+        problem = dataclasses.replace(arm_plan.problem, scenarios=scenarios)
+        told = f"solution are none, those of the problem {scenarios[0].name}, .*leave start out"
+        with pytest.raises(InputError, match=told):
+            plan(problem, start=start)
+
+
 # ---- the command
 
 

@@ -1,9 +1,8 @@
 """Drafts of problem files from a URDF or MJCF alone: `impactopt new --urdf FILE`.
 
-* description.py        finds the file
 * limbs.py              classifies joints as legs, arms, fingers and wheels
 * default_drives.py     guesses the drive parameters that the file lacks
-* robot.py              makes a robot of the description
+* robot.py              finds the description and makes a robot of it
 * soles.py, strikers.py   find soles and strikers in the links' shapes and frames
 * postures.py           finds standing postures and bent arms
 * hits.py               chooses targets and contact laws

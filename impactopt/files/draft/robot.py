@@ -12,7 +12,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece, pieces_of
-from impactopt.errors import InputError
+from impactopt.codegen.files import is_plain_file
+from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.draft.default_drives import RANGE, Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, limbs_of, to_lock, toes, unshared
 from impactopt.robots.build import is_floating, lock_joints
@@ -20,10 +21,12 @@ from impactopt.robots.checks import LEG, REPAIRED, check_inertias
 from impactopt.robots.couplings import unfit
 from impactopt.robots.description import Description, Tie
 from impactopt.robots.mjcf import read_mjcf
+from impactopt.robots.presets import example_robots
 from impactopt.robots.robot import Robot
 from impactopt.robots.urdf import read_urdf
 
 Array = NDArray[np.float64]
+SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may have another dot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +62,38 @@ class Drafted:
         """The robot read again, with additional options."""
         make = Robot.from_mjcf if self.mjcf else Robot.from_urdf
         return make(self.path, inertias=REPAIRED, **{**self.options, **more})
+
+
+def find_description(given: str) -> Path:
+    """The file at a path, or the URDF of a name in example-robot-data, such as "panda" or "ur5_robot".
+
+    Raises
+    ------
+    InputError : there is none, or there are several; the message lists them.
+    """
+    path = Path(given).expanduser()
+    if is_plain_file(path):
+        return path
+    if path.suffix.lower() in SUFFIXES or len(path.parts) != 1:
+        raise InputError(f"there is no file {shortened(given, 300)}")
+    known = _examples()
+    if given in known:
+        return known[given]
+    near = sorted(name for name in known if name.startswith(f"{given}_"))
+    if f"{given}_robot" in near or len(near) == 1:
+        return known[f"{given}_robot" if f"{given}_robot" in near else near[0]]
+    if near:
+        raise InputError(f"example-robot-data has several robots {given!r}: {', '.join(near)}; name one")
+    raise InputError(
+        f"there is no file {shortened(given)!r}, and no such robot in example-robot-data"
+        f"{did_you_mean(given, known)}; it has {', '.join(sorted(known))}"
+    )
+
+
+def _examples() -> dict[str, Path]:
+    """URDFs by their names without suffix."""
+    folder = example_robots("a robot by its name")
+    return {path.stem: path for path in sorted(folder.glob("*/*/*.urdf"))}
 
 
 def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Drafted:

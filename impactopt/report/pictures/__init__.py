@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from impactopt.errors import InputError, check_choice
+from impactopt.errors import InputError, check_choice, check_kind
 from impactopt.files.output import record_of, write_file
 from impactopt.files.record import Record
 from impactopt.planning.solution import Solution
@@ -77,10 +77,13 @@ def plot(
     Raises
     ------
     InputError : an unknown picture; one that the solution does not have, such as the ZMP of an arm; a plan
-        whose motion cannot be completed; axes that are no part of a grid, for several panels.
+        whose motion cannot be completed; simulations or axes of another type; axes that are no part of a
+        grid, for several panels.
     """
     draws = {"overview": overview, **PICTURES}
     check_choice("there is no picture", what, draws)
+    if ax is not None:
+        check_kind("ax", ax, Axes)
     record = record_of(solution, simulation=simulation, replay=replay)
     if not record.completed:
         raise InputError(f"there is no motion to draw: {record.summary['note']}")

@@ -378,3 +378,16 @@ def test_axes_without_a_grid_are_refused(biped_plan: Planned) -> None:
     free = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     with pytest.raises(InputError, match="no part of a grid"):
         solution_of(biped_plan).plot("motion", ax=free)
+
+
+@pytest.mark.parametrize("name", ["ax", "simulation", "replay"])
+def test_arguments_of_other_types_are_refused(arm_plan: Planned, tmp_path: Path, name: str) -> None:
+    solution, given = solution_of(arm_plan), {name: 3}
+    with pytest.raises(InputError, match=f"{name} must be an? .*, not 3"):
+        solution.plot("force", **given)
+    if name == "ax":
+        return
+    with pytest.raises(InputError, match=f"{name} must be a Simulation, not 3"):
+        solution.animate(**given)
+    with pytest.raises(InputError, match=f"{name} must be a Simulation, not 3"):
+        solution.report(tmp_path / "page.html", **given)

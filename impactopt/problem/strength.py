@@ -213,7 +213,7 @@ def drawn_impacts(
             facing = facing & (local @ face.normal >= min_face_cosine)
             near = facing.copy()
             near[facing] = (local[facing] @ face.corners.T).max(axis=-1) <= face.ahead + most
-        for chosen, drawn in ((near, behind), (facing & ~near.any(axis=1)[:, None], others)):
+        for chosen, drawn in ((near, behind), (facing & ~near.any(axis=1, keepdims=True), others)):
             some = np.flatnonzero(chosen.any(axis=1))[: POSTURES - len(drawn)]
             drawn += [(postures[k], lines[k, chosen[k]]) for k in some]
         if len(behind) == POSTURES:

@@ -73,89 +73,98 @@ class Strength:
     law: ContactLaw
     target: Target
 
-    def at(self, q: Array, normals: Sequence[Array]) -> list[EstimatedImpact]:
-        """Impacts in a configuration (nq,), one along each normal (3,) along which the striking point can
-        move.
+    def at(self, q: Array, normals: Array) -> list[EstimatedImpact]:
+        """Impacts of configurations (k, nq), each along its normal of (k, 3), if the striking point can move
+        along it.
 
         The impulse is mu s. mu is the reduced mass of target and effective mass. s is the largest speed along
         the normal, without speed across it, within three limits: of the joints' velocities; of the torques,
         which accelerate all joints evenly, each over its travel from a limit of position, at most
         `MAX_SWING`; and of the gear loads, from the rotors' deceleration under the peak force.
         """
-        robot = self.robot
-        model, data = robot.model, robot.model.createData()
+        robot, model, data = self.robot, self.robot.model, self.robot.model.createData()
         frame = model.getFrameId(robot.striker(self.striker).model_frame)
-        inertia = mass_matrix(model, data, q)
-        jac = np.reshape(
-            pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED), (6, model.nv)
-        )[:3]
-        weight = np.abs(robot.generalized_gravity(data, q))
-        point = np.array(data.oMf[frame].translation)
-        response = np.linalg.solve(inertia, jac.T)  # (nv, 3) velocities by unit impulses at the point
+        inertia, jac = np.zeros((len(q), model.nv, model.nv)), np.zeros((len(q), 3, model.nv))
+        weight, point = np.zeros((len(q), model.nv)), np.zeros((len(q), 3))
+        for k, posture in enumerate(q):
+            inertia[k] = mass_matrix(model, data, posture)
+            jac[k] = np.reshape(
+                pin.computeFrameJacobian(model, data, posture, frame, pin.LOCAL_WORLD_ALIGNED), (6, model.nv)
+            )[:3]
+            weight[k] = np.abs(robot.generalized_gravity(data, posture))
+            point[k] = data.oMf[frame].translation
+        back = jac.swapaxes(1, 2)
+        response = np.linalg.solve(inertia, back)  # (k, nv, 3) velocities by unit impulses at the point
         mobility = jac @ response
-        angles = robot.joint_positions(q)
-        # largest travel of each joint before contact, in positive and in negative direction
-        travel = [
-            np.clip(angles - robot.lower, 0.0, MAX_SWING),
-            np.clip(robot.upper - angles, 0.0, MAX_SWING),
+        inverse_mass = np.einsum("ki,kij,kj->k", normals, mobility, normals)
+        weighted = robot.velocity_limit[:, None] ** 2 * back
+        # velocities (2, k, nv) for 1 m/s along the normal: of least kinetic energy, and of least squares over
+        # the limits
+        ways = np.stack(
+            [_least_squares(response, mobility, normals), _least_squares(weighted, jac @ weighted, normals)]
+        )
+        speeds = self._swing_speeds(ways, normals, jac, inertia, weight, robot.joint_positions(q))
+        best, each = speeds.argmax(axis=0), np.arange(len(q))
+        mass = 1.0 / (np.maximum(inverse_mass, 1e-300) + self._target_inverse_mass())
+        speed = np.minimum(
+            speeds[best, each], self._gear_speeds((response @ normals[:, :, None])[..., 0], mass)
+        )
+        return [
+            EstimatedImpact(
+                q=q[k],
+                v=speed[k] * ways[best[k], k],
+                point=point[k],
+                normal=normals[k],
+                impulse=float(mass[k] * speed[k]),
+            )
+            for k in np.flatnonzero(inverse_mass > 1e-9 * np.trace(mobility, axis1=1, axis2=2))
         ]
-        weighted = jac * robot.velocity_limit**2
-        out = []
-        for n in normals:
-            inverse_mass = float(n @ mobility @ n)
-            if inverse_mass <= 1e-9 * np.trace(mobility):  # it cannot move along the normal
-                continue
-            # velocities (nv,) for 1 m/s along n: of least kinetic energy, and of least squares over the
-            # limits
-            candidates = (
-                response @ _least_squares(mobility, n),
-                weighted.T @ _least_squares(weighted @ jac.T, n),
-            )
-            best = max(
-                (self._swing_speed(v, n, jac, inertia, weight, travel), k, v)
-                for k, v in enumerate(candidates)
-            )
-            speed, direction = best[0], best[2]
-            mass = 1.0 / (inverse_mass + self._target_inverse_mass())
-            speed = min(speed, self._gear_speed(response @ n, mass))
-            out.append(EstimatedImpact(q=q, v=speed * direction, point=point, normal=n, impulse=mass * speed))
-        return out
 
     def _target_inverse_mass(self) -> float:
         """Inverse mass [1/kg] of the target."""
         return 1.0 / self.target.mass if isinstance(self.target, FreeMass) else 0.0
 
-    def _swing_speed(
-        self, direction: Array, n: Array, jac: Array, inertia: Array, weight: Array, travel: list[Array]
-    ) -> float:
-        """Largest speed [m/s] of a swing whose velocities (nv,) at 1 m/s are ``direction``; 0 if these do not
-        move the point along n.
+    def _swing_speeds(
+        self, ways: Array, normals: Array, jac: Array, inertia: Array, weight: Array, angles: Array
+    ) -> Array:
+        """Largest speeds (2, k) [m/s] of swings whose velocities (2, k, nv) at 1 m/s are ``ways``; 0 if these
+        do not move the point along its normal.
         """
         robot = self.robot
-        if np.linalg.norm(jac @ direction - n) > 1e-6:
-            return 0.0
-        size = np.maximum(np.abs(direction), 1e-9)
-        joint_travel = np.where(direction > 0, travel[0], travel[1])
+        size = np.maximum(np.abs(ways), 1e-9)
+        # largest travel of each joint before contact: in positive direction from its lower limit
+        room = np.where(ways > 0, angles - robot.lower, robot.upper - angles)
         torque = np.maximum(TorqueLimit().fraction * robot.torque_limit - weight, 0.0)
         # distance and constant acceleration of the point, by the joint that limits each: v^2 = 2 a s
-        distance = float((joint_travel / size).min())
-        acceleration = float((torque / np.maximum(np.abs(inertia @ direction), 1e-9)).min())
-        return min(float((robot.velocity_limit / size).min()), float(np.sqrt(2.0 * distance * acceleration)))
+        distance = (np.clip(room, 0.0, MAX_SWING) / size).min(axis=-1)
+        pushed = np.abs((inertia @ ways[..., None])[..., 0])
+        acceleration = (torque / np.maximum(pushed, 1e-9)).min(axis=-1)
+        speeds = np.minimum(
+            (robot.velocity_limit / size).min(axis=-1), np.sqrt(2.0 * distance * acceleration)
+        )
+        along = np.linalg.norm((jac @ ways[..., None])[..., 0] - normals, axis=-1) <= 1e-6
+        return np.where(along, speeds, 0.0)
 
-    def _gear_speed(self, jump: Array, mass: float) -> float:
-        """Largest speed [m/s] at which the gears carry the impact; jump (nv,) : velocities by 1 N s."""
+    def _gear_speeds(self, jumps: Array, mass: Array) -> Array:
+        """Largest speeds (k,) [m/s] at which the gears carry the impact; jumps (k, nv) : velocities by
+        1 N s.
+        """
         robot = self.robot
         stiffness = float(self.law.force(STIFFNESS_DEPTH, 0.0)) / STIFFNESS_DEPTH
         damping = float(self.law.force(STIFFNESS_DEPTH, 1.0)) - float(self.law.force(STIFFNESS_DEPTH, 0.0))
         # [N] peak at 1 m/s, of the spring or the damper alone
-        force = max(np.sqrt(stiffness * mass), damping)
-        size = np.maximum(np.abs(jump), 1e-12)
+        force = np.maximum(np.sqrt(stiffness * mass), damping)
+        size = np.maximum(np.abs(jumps), 1e-12)
         gears = robot.gear_limit * robot.torque_limit / np.maximum(robot.armature * size, 1e-12)
-        return float(gears.min()) / force
+        return np.asarray(gears.min(axis=-1) / force)
 
 
-def _least_squares(matrix: Array, n: Array) -> Array:
-    return np.asarray(np.linalg.lstsq(matrix, n, rcond=1e-9)[0])
+def _least_squares(ways: Array, moves: Array, normals: Array) -> Array:
+    """Combinations (k, nv) of the columns of ways (k, nv, 3), which move the point by moves (k, 3, 3), that
+    move it along the normals (k, 3).
+    """
+    solved = np.linalg.pinv(moves, rcond=1e-9) @ normals[:, :, None]
+    return np.asarray((ways @ solved)[..., 0])
 
 
 def drawn_impacts(
@@ -171,38 +180,49 @@ def drawn_impacts(
     """
     robot = strength.robot
     model, data = robot.model, robot.model.createData()
-    frame = model.getFrameId(robot.striker(strength.striker).model_frame)
+    hit = robot.striker(strength.striker)
+    frame = model.getFrameId(hit.model_frame)
     face = striker_face(robot, strength.striker) if with_face else None
     min_face_cosine, most = float(np.cos(FirstTouch().angle)), FirstTouch().depth + MAX_BEYOND
-    rng, limb = np.random.default_rng(0), np.array(robot.limb(robot.striker(strength.striker).model_frame))
+    rng, limb, first = np.random.default_rng(0), np.array(robot.limb(hit.model_frame)), robot.nv - robot.n
     low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
     low, high = low + LIMIT_MARGIN * (high - low), high - LIMIT_MARGIN * (high - low)
     own = robot.joint_positions(q)[limb]
-    # postures with directions: with the link behind the target's plane, and others that meet it face on
-    behind, others = list[tuple[Array, Sequence[Array]]](), list[tuple[Array, Sequence[Array]]]()
-    for _ in range(MAX_DRAWN):
-        step = np.zeros(robot.nv)
-        step[robot.nv - robot.n + limb] = rng.uniform(low, high) - own
-        posture, directions = np.array(pin.integrate(model, q, step)), normals
+    # postures with their lines: with the link behind the target's plane, and others that meet it face on
+    behind, others = list[tuple[Array, Array]](), list[tuple[Array, Array]]()
+    for _ in range(MAX_DRAWN // POSTURES):
+        steps = np.zeros((POSTURES, robot.nv))
+        steps[:, first + limb] = rng.uniform(low, high, (POSTURES, len(limb))) - own
+        postures = np.array([pin.integrate(model, q, step) for step in steps])
+        lines = np.tile(normals, (POSTURES, 1, 1))
+        facing = np.ones(lines.shape[:2], dtype=bool)
         if len(limb) == 1:
-            jac = pin.computeFrameJacobian(model, data, posture, frame, pin.LOCAL_WORLD_ALIGNED)
-            tangent = np.reshape(jac, (6, robot.nv))[:3, robot.nv - robot.n + limb[0]]
-            both = np.outer([1.0, -1.0], tangent / max(float(np.linalg.norm(tangent)), 1e-9))
-            directions = [line for line in both if max(n @ line for n in normals) > MIN_COSINE]
-        near = directions
+            jacs = [
+                pin.computeFrameJacobian(model, data, posture, frame, pin.LOCAL_WORLD_ALIGNED)
+                for posture in postures
+            ]
+            tangents = np.reshape(jacs, (POSTURES, 6, robot.nv))[:, :3, first + limb[0]]
+            tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1), 1e-9)[:, None]
+            lines = np.stack([tangents, -tangents], axis=1)
+            facing = (lines @ np.transpose(normals)).max(axis=-1) > MIN_COSINE
+        near = facing
         if face is not None:
-            pin.framesForwardKinematics(model, data, posture)
-            own_frame = data.oMf[frame].rotation.T
-            directions = [n for n in directions if face.normal @ (own_frame @ n) >= min_face_cosine]
-            near = [n for n in directions if (face.corners @ (own_frame @ n)).max() <= face.ahead + most]
-        if len(near):
-            behind.append((posture, near))
-        elif len(directions) and len(others) < POSTURES:
-            others.append((posture, directions))
+            place = model.frames[frame]
+            turns = robot.forward_kinematics(postures)[0][:, place.parentJoint] @ place.placement.rotation
+            local = lines @ turns
+            facing = facing & (local @ face.normal >= min_face_cosine)
+            near = facing.copy()
+            near[facing] = (local[facing] @ face.corners.T).max(axis=-1) <= face.ahead + most
+        for chosen, drawn in ((near, behind), (facing & ~near.any(axis=1, keepdims=True), others)):
+            some = np.flatnonzero(chosen.any(axis=1))[: POSTURES - len(drawn)]
+            drawn += [(postures[k], lines[k, chosen[k]]) for k in some]
         if len(behind) == POSTURES:
             break
-    chosen = behind if len(behind) >= MIN_POSTURES else [*behind, *others]
-    impacts = [impact for posture, directions in chosen for impact in strength.at(posture, directions)]
+    pairs = behind if len(behind) >= MIN_POSTURES else [*behind, *others]
+    if not pairs:
+        return []
+    each = np.repeat([posture for posture, _ in pairs], [len(along) for _, along in pairs], axis=0)
+    impacts = strength.at(each, np.concatenate([along for _, along in pairs]))
     reach = max((float(np.linalg.norm(impact.point[:2])) for impact in impacts), default=0.0)
     away = [b for b in impacts if np.linalg.norm(b.point[:2]) > MIN_AHEAD * reach and b.impulse > 0]
     # an arm may only reach to a side of its base, as Stretch's does
@@ -249,7 +269,9 @@ def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
                 continue
             needed = float(np.max(np.abs(robot.joint_positions(q) - start) / robot.velocity_limit))
             decay = np.exp(-DECAY * needed / p.swing.duration[1])
-            estimate = decay * max((impact.impulse for impact in strength.at(q, [p.normal])), default=0.0)
+            estimate = decay * max(
+                (impact.impulse for impact in strength.at(q[None], p.normal[None])), default=0.0
+            )
             if estimate > best:
                 best, chosen = estimate, q
     return chosen
@@ -278,7 +300,7 @@ def best_share(problem: ImpactProblem) -> tuple[float, EstimatedImpact] | None:
         guess = pin.integrate(p.robot.model, p.contact_posture, rng.standard_normal(p.robot.nv))
         with suppress(InputError):
             postures.append(inverse_kinematics(p.coordinates, p.striker, p.point, guess, starts=1))
-    own = [impact.impulse for q in postures for impact in strength.at(q, [p.normal])]
+    own = [b.impulse for b in strength.at(np.array(postures), np.tile(p.normal, (len(postures), 1)))]
     drawn = drawn_impacts(
         strength, p.start_posture, (*NORMALS, p.normal), with_face=p.term(FirstTouch).enabled
     )

@@ -70,13 +70,13 @@ def test_draws_are_within_what_is_said_and_fill_it(punch: ImpactProblem) -> None
 
 
 def test_a_point_out_of_reach_is_drawn_again(punch: ImpactProblem) -> None:
-    around = (2.0, 0.01, 0.01)
+    around = (0.5, 0.01, 0.01)
     for k in range(20):
         problem, numbers = drawn_problem(punch, around, np.random.default_rng(k), "far")
         if numbers["points_drawn"] > 1:
             break
     else:
-        pytest.fail("two metres away is within reach")
+        pytest.fail("half a metre away is within reach")
     points = draw(punch, around, np.random.default_rng(k))["points"]
     assert problem.point.tolist() == numbers["point_m"] == points[numbers["points_drawn"] - 1].tolist()
     for point in points[: numbers["points_drawn"] - 1]:

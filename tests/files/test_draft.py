@@ -36,11 +36,13 @@ from impactopt import (
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.visuals import visuals_of
 from impactopt.cli.app import app
+from impactopt.files.draft import strong
 from impactopt.files.draft.default_drives import guess_drives
 from impactopt.files.draft.drafting import Draft, draft_problem
 from impactopt.files.draft.robot import Drafted, draft_robot, find_description
 from impactopt.files.draft.soles import sides
 from impactopt.files.draft.strikers import find_striker
+from impactopt.files.draft.strong import MAX_STRIKES
 from impactopt.files.toml import read_toml
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.problem.feasibility import hopeless, sticks_out, too_weak
@@ -54,10 +56,16 @@ FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
 _drafts: dict[Any, Draft] = {}
 
 
+@pytest.fixture(autouse=True)
+def few_strikes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two tried strikes are enough where it does not matter how hard the drafted one is."""
+    monkeypatch.setattr(strong, "MAX_STRIKES", 2)
+
+
 def _drafted(folder: Path, text: str, **options: Any) -> Draft:
     """A description's draft, made once: it is the same in every folder."""
     (folder / "robot.urdf").write_text(text)
-    key = text, *sorted(options.items())
+    key = text, strong.MAX_STRIKES, *sorted(options.items())
     if key not in _drafts:
         given = {"planned": False, **options}
         _drafts[key] = draft_problem(folder / "robot.urdf", folder=folder, **given)
@@ -404,8 +412,9 @@ def _strike(problem: ImpactProblem) -> float:
     return solved.impulse if solved.status.usable else 0.0
 
 
-def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
+def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At least 0.8 of the best of 20 strikes elsewhere, at points and normals that are drawn here."""
+    monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
     problem = _problem(tmp_path, urdfs.arm())
     drafted, model = _strike(problem), problem.robot.model
     rng, data, elsewhere = np.random.default_rng(1), model.createData(), []
@@ -592,8 +601,9 @@ def test_where_no_plan_is_found_motions_may_last_longer(
     assert solve(problem).status.usable
 
 
-def test_a_flange_that_the_wrist_hides_gets_a_peg(tmp_path: Path) -> None:
+def test_a_flange_that_the_wrist_hides_gets_a_peg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As of some makers' arms: with nothing mounted the link before would touch the target first."""
+    monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
     hidden, shown = urdfs.arm(), '<origin xyz="0.0 0.0 0.15"/><geometry><box size="0.08 0.08 0.3"/>'
     at = hidden.index(shown, hidden.index('<link name="elbow_link"'))
     around = '<origin xyz="0.0 0.0 0.235"/><geometry><box size="0.2 0.2 0.47"/>'

@@ -35,7 +35,7 @@ from impactopt import (
     Target,
 )
 from impactopt.report.console import replay_table
-from impactopt.simulation import Scene, Simulation, robustness, simulate, simulate_mujoco, simulate_pinocchio
+from impactopt.simulation import Scene, Simulation, robustness, scene_of, simulate_mujoco, simulate_pinocchio
 from impactopt.simulation.engines import check_steps, with_step_error
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.transcription.initial_guess import first_iterate
@@ -300,10 +300,10 @@ def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[
     assert result.status is Status.SOLVED, result.message
     plan = transcription.decode(result.x)
     motion = dataclasses.replace(plan.trajectory(), end=plan.contact_end + 0.01)  # the blow is what counts
-    for engine, step in (("pinocchio", 1e-4), ("mujoco", 2.5e-5)):
-        sim = simulate(problem, motion, engine=engine, step=step, settle=0.0)
+    for name, engine, step in (("pinocchio", simulate_pinocchio, 1e-4), ("mujoco", simulate_mujoco, 2.5e-5)):
+        sim = engine(robot, motion, scene_of(problem), step=step, settle=0.0)
         missed = law.damping * plan.hand_speed * step
-        assert sim.impulse == pytest.approx(plan.impulse, rel=5e-3, abs=missed), engine
+        assert sim.impulse == pytest.approx(plan.impulse, rel=5e-3, abs=missed), name
         assert sim.peak_force == pytest.approx(plan.collision.force.max(), rel=0.03)
         assert sim.contact_end - sim.contact_start == pytest.approx(
             plan.compression + plan.restitution, rel=0.01, abs=2.1 * step
@@ -313,6 +313,6 @@ def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[
         report = sim.report(**known, planned_impulse=plan.impulse)
         assert report["target"] == sim.outcome
         summary = {"target": plan.collision.outcome, "impulse_Ns": plan.impulse}
-        labels = " ".join(map(str, replay_table({**report, "engine": engine}, summary).columns[0].cells))
+        labels = " ".join(map(str, replay_table({**report, "engine": name}, summary).columns[0].cells))
         assert ("driven into the wood" in labels) == isinstance(target, Nail)
         assert ("the board breaks" in labels) == isinstance(target, Board)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations, pairwise
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -62,7 +62,7 @@ def _covered(figure: Figure, renderer: Any) -> Iterator[str]:
                 points = np.asarray(line.get_xydata(), dtype=float)
                 if line.get_transform() != axes.transData or len(points) < 2:
                     continue
-                fine = np.concatenate([np.linspace(a, b, 20) for a, b in pairwise(points)])
+                fine = np.linspace(points[:-1], points[1:], 20).reshape(-1, 2)
                 x, y = axes.transData.transform(fine[np.isfinite(fine).all(axis=1)]).T
                 inside = (x > box.x0) & (x < box.x1) & (y > box.y0) & (y < box.y1)
                 shown = (x > axes.bbox.x0) & (x < axes.bbox.x1) & (y > axes.bbox.y0) & (y < axes.bbox.y1)

@@ -36,6 +36,7 @@ class ContactLaw(Described, ABC):
     """
 
     word: ClassVar[str] = ""
+    _symbolic: ClassVar[bool] = False  # True in the class of a law whose branches take CasADi expressions
 
     def __post_init__(self) -> None:
         check_numbers(self)
@@ -47,17 +48,19 @@ class ContactLaw(Described, ABC):
         call : how they are called, for the message.
         """
         name, phases = type(self).__name__, {True: "compression", False: "restitution"}
-        x, rate, symbols = ca.SX.sym("x"), ca.SX.sym("rate"), {p: ca.SX.sym(p) for p in self.parameters}
-        for compressing, phase in phases.items():
-            try:
-                size = ca.SX(self.branch(x, rate, compressing, symbols)).numel()
-            except Exception as error:
-                raise InputError(
-                    f"{name}: {phase}: cannot be called with CasADi expressions as {call}, with casadi.fmax "
-                    f"and casadi.if_else in the place of max and if: {error}"
-                ) from error
-            if size != 1:
-                raise InputError(f"{name}: {phase}: gives {size} expressions; one force is wanted")
+        if "_symbolic" not in vars(type(self)):  # whatever the numbers are, so once for each class
+            x, rate, symbols = ca.SX.sym("x"), ca.SX.sym("rate"), {p: ca.SX.sym(p) for p in self.parameters}
+            for compressing, phase in phases.items():
+                try:
+                    size = ca.SX(self.branch(x, rate, compressing, symbols)).numel()
+                except Exception as error:
+                    raise InputError(
+                        f"{name}: {phase}: cannot be called with CasADi expressions as {call}, with "
+                        f"casadi.fmax and casadi.if_else in the place of max and if: {error}"
+                    ) from error
+                if size != 1:
+                    raise InputError(f"{name}: {phase}: gives {size} expressions; one force is wanted")
+            type(self)._symbolic = True
         for depth in _DEPTHS:
             there, back = (float(self.branch(depth, 0.0, compressing)) for compressing in phases)
             if abs(there - back) > _SAME * max(abs(there), abs(back)):

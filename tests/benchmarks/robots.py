@@ -1,8 +1,8 @@
 """Anyone's robot at the first try: every arm and biped of example-robot-data, drafted, planned and replayed.
 
 One row a robot, with no line of its draft edited: seconds of drafting, how the solver ended, the replays in
-both engines, whether it stands; and for a bolted arm the drafted motion's share of the best one that random
-targets find. What cannot be drafted is a row, too, with the reason.
+both engines, whether it stands; and for a bolted arm the impulse of the drafted motion over that of the best
+one to random targets. What cannot be drafted is a row, too, with the reason.
 """
 
 from __future__ import annotations
@@ -170,7 +170,8 @@ def _row(
     if targets and not problem.robot.floating:
         motions = motions_to_random(problem, rng, targets)
         own = solution.impulse if solution.status.usable else 0.0
-        out |= {"motions": len(motions), "share": own / max(motions) if motions else None}
+        best = max(motions, default=None)
+        out |= {"motions": len(motions), "best_Ns": best, "share": own / best if best else None}
     return out | (_replayed(solution) if solution.status.usable else {})
 
 

@@ -26,7 +26,7 @@ from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_edge, find_striker, find_toe
-from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest
+from impactopt.files.draft.strong import FOLLOW, ITERATIONS, SECONDS, SWING, Strong, durations, strongest
 from impactopt.files.draft.target_placement import STRIKE_DIRECTIONS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
@@ -53,7 +53,6 @@ MAX_MOTIONS = 2  # whole motions of a bolted arm that are compared
 WORTH_A_PLAN = 1.05
 SLIGHT = 0.35  # component of a direction that is not named in words: 20 degrees
 MAX_STROKES = 3  # targets of a robot on legs, below its hand, that a strike is tried to
-SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # durations [s] for fast robots
 SHIFT = (0.6, 1.2)  # duration [s] from two feet to one, and back
 START = "ready"
 FROM_ABOVE = ("chop", "nail")
@@ -286,8 +285,8 @@ def _strike_data(
     """Data of a bolted arm's strike."""
     data = {**_data(drafted, robot, [], strikers, strong.start, folder), **hit.data}
     way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
-    for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
-        data[phase]["duration_s"] = duration(robot, way, usual)
+    for phase, bounds in durations(robot, way).items():
+        data[phase]["duration_s"] = list(bounds)
     data = _edgewise(data) if edgewise else data
     return _aimed(data, arm.name, iter([strong.point]), strong.normal, folder)
 

@@ -36,6 +36,7 @@ RUN_UP, TRAVEL = 0.7, (0.35, 0.9)
 TRAVEL_FACTORS = (1.0, 0.75, 0.55, 0.4)  # on the travel, tried while joint limits or bodies are in conflict
 # least distance of the start behind the target's plane: the smaller of so many [m] and so much of the reach
 BEHIND = 0.06, 0.15
+SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # durations [s] for fast robots
 DURATION_FACTORS = (0.8, 3.0)  # shortest and longest duration over the time at the velocity limits
 AFTER = 0.6  # [s] in which a target that flies away may not meet the base
 AFTER_STEP = 0.03  # [m] of its travel between two tests
@@ -94,18 +95,17 @@ def strongest(
     return sorted(found, key=lambda strong: -strong.objective), "" if nearest is None else nearest.message
 
 
-def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:
-    """[shortest, longest] duration [s] of a phase in which joints travel `way` (n,) [rad], with or without
-    winding up.
+def durations(robot: Robot, way: Array) -> dict[str, tuple[float, float]]:
+    """Shortest and longest duration [s] of swing and follow, in which joints travel `way` (n,) [rad], with or
+    without winding up.
 
-    usual : durations of fast robots, at least. Slow joints need at least the travel over their velocity
-    limit. Three times that is enough to wind up, and not too long for a spline of few intervals.
+    Slow joints need at least the travel over their velocity limit. Three times that is enough to wind up, and
+    not too long for a spline of few intervals.
     """
     needed = float(np.max(np.abs(way) / robot.velocity_limit))
-    return [
-        max(short, float(f"{factor * needed:.2g}"))
-        for short, factor in zip(usual, DURATION_FACTORS, strict=True)
-    ]
+    slow = [float(f"{factor * needed:.2g}") for factor in DURATION_FACTORS]
+    usual = {"swing": SWING, "follow": FOLLOW}
+    return {name: (max(low, slow[0]), max(high, slow[1])) for name, (low, high) in usual.items()}
 
 
 def _candidates(
@@ -127,7 +127,8 @@ def _candidates(
         near = [b for b in taken if b.normal @ impact.normal > ALIKE]
         if any(np.linalg.norm(b.point - impact.point) < MIN_DISTANCE * reach for b in near):
             continue
-        problem = _problem(robot, arm, impact, min(BEHIND[0], BEHIND[1] * reach), given, clipped)
+        behind = min(BEHIND[0], BEHIND[1] * reach)
+        problem = strike_problem(robot, arm.name, impact, behind=behind, given=given, clipped=clipped)
         if problem is None:
             continue
         taken.append(impact)
@@ -136,14 +137,24 @@ def _candidates(
             return
 
 
-def _problem(
-    robot: Robot, arm: Arm, impact: EstimatedImpact, behind: float, given: Mapping[str, Any], clipped: bool
+def strike_problem(
+    robot: Robot,
+    striker: str,
+    impact: EstimatedImpact,
+    *,
+    behind: float,
+    given: Mapping[str, Any],
+    clipped: bool = False,
 ) -> ImpactProblem | None:
-    """Problem of an estimated impact, with a start posture at least `behind` [m] behind the target's plane;
-    None if no start posture is feasible.
+    """Problem of an estimated impact, with a start posture from which a swing leads to it; None if no start
+    posture is feasible.
+
+    behind : least distance [m] of the start behind the target's plane.  given : other arguments of
+    `ImpactProblem`.  clipped : joints with less range than their run-up begin at its end.
     """
     # fewer than three joints reach a curve or a surface only, from which rounding would move the point
-    point = np.round(impact.point, 3 if len(arm.limb.path) > 2 else 9) + 0.0
+    joints = len(robot.limb(robot.striker(striker).model_frame))
+    point = np.round(impact.point, 3 if joints > 2 else 9) + 0.0
     size = float(np.abs(impact.v).max())
     way = impact.v / size * float(np.clip(RUN_UP * size, *TRAVEL))
     for factor in TRAVEL_FACTORS:
@@ -153,13 +164,13 @@ def _problem(
         within = np.clip(angles, robot.lower + edge, robot.upper - edge)
         start = np.array(pin.integrate(robot.model, start, within - angles)) if clipped else start
         inside = clipped or np.array_equal(angles, within)
-        at = striking_point(robot, arm.name, start)
+        at = striking_point(robot, striker, start)
         if not inside or impact.normal @ (point - at) < behind or at[2] < LOWEST / 2:
             continue
         try:
             problem = ImpactProblem(
                 robot=robot,
-                striker=arm.name,
+                striker=striker,
                 point=point,
                 normal=impact.normal,
                 stance=FixedBase(),

@@ -333,11 +333,11 @@ def _sources(file: Path) -> Iterator[tuple[Path, object]]:
 
 
 def _including(file: Path) -> str:
-    """Name of a file beside an MJCF that includes it, and may have what it lacks; "" if there is none."""
+    """Name of a file beside an MJCF that includes it and has what it lacks; "" if there is none."""
     for other in sorted(file.parent.glob("*.xml")):
-        with contextlib.suppress(OSError, ElementTree.ParseError):
+        with contextlib.suppress(OSError, ElementTree.ParseError, ValueError):
             included = (part.get("file") for part in ElementTree.parse(other).iter("include"))
-            if other != file and file.name in included:
+            if other != file and file.name in included and _compiled(str(other), frozenset(_sources(other))):
                 return other.name
     return ""
 

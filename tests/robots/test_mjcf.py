@@ -310,6 +310,12 @@ def test_a_part_of_a_scene_is_told_where_the_whole_is(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"scene\.xml includes this file: give that one"):
         read_mjcf(tmp_path / "robot.xml")
     assert read_mjcf(tmp_path / "scene.xml").model.nv == 1
+    (tmp_path / "scene.xml").write_text(
+        '<mujoco><include file="robot.xml"/><asset><mesh name="lost" file="lost.stl"/></asset></mujoco>'
+    )
+    with pytest.raises(InputError, match="'floor' not found") as lost:
+        read_mjcf(tmp_path / "robot.xml")
+    assert "includes" not in str(lost.value)
 
 
 def test_a_problem_file_can_name_an_mjcf(tree: Path) -> None:

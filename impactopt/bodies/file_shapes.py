@@ -6,7 +6,6 @@ import contextlib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -141,13 +140,7 @@ class Geom:
 
 def geoms_of(model: Any, mjcf: str) -> list[Geom]:
     """Geoms of a pin.Model's bodies; planes, height fields and signed distance fields are left out."""
-    # The time of the last change is a part of the cache's key.
-    return list(_geoms(model, _compiled(mjcf, Path(mjcf).stat().st_mtime_ns)))
-
-
-@lru_cache(maxsize=4)
-def _compiled(mjcf: str, _changed: int) -> Any:
-    return compile_mjcf(mjcf)
+    return list(_geoms(model, compile_mjcf(mjcf)))
 
 
 def _geoms(model: Any, mj: Any) -> Iterator[Geom]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -292,26 +293,51 @@ _SLIDES = (pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ)
 
 
 def compile_mjcf(path: str | PathLike[str]) -> Any:
-    """The mujoco.MjModel of a file; InputError if there is none, with the compiler's message."""
+    """The mujoco.MjModel of a file, shared by all callers; InputError if there is none, with the compiler's
+    message."""
     file = existing(path, "MJCF")
     try:
-        import mujoco
+        import mujoco  # noqa: F401
     except ImportError as error:
         raise missing_package("a robot from an MJCF", "mujoco", "validate") from error
     try:
-        return mujoco.MjModel.from_xml_path(file)
+        return _compiled(file, frozenset(_sources(Path(file))))
     except ValueError as error:
         whole = _including(Path(file))
         fix = f"; {whole} includes this file: give that one" if whole else ""
         raise InputError(f"MJCF {file}: {error}{fix}") from error
 
 
+@lru_cache(maxsize=4)  # hulls of large meshes take seconds, and a draft reads its file ten times
+def _compiled(file: str, _sources: frozenset[tuple[Path, object]]) -> Any:
+    import mujoco
+
+    return mujoco.MjModel.from_xml_path(file)
+
+
+def _sources(file: Path) -> Iterator[tuple[Path, object]]:
+    """Files that an MJCF is compiled from, with the content of XML files and the time of change of others."""
+    folders, names, left, done = {"."}, set[str](), {file}, set[Path]()
+    while left:
+        done |= left
+        for source in left:
+            text = source == file or source.suffix == ".xml"
+            content = source.read_bytes() if text else source.stat().st_mtime_ns
+            yield source, content
+            with contextlib.suppress(ElementTree.ParseError):
+                for part in ElementTree.fromstring(content).iter() if isinstance(content, bytes) else ():
+                    folders.update(part.get(key, ".") for key in ("assetdir", "meshdir", "texturedir"))
+                    names.add(part.get("file", "."))
+        named = {file.parent / folder / name for folder in folders for name in names}
+        left = {source for source in named - done if source.is_file()}
+
+
 def _including(file: Path) -> str:
-    """Name of a file beside an MJCF that includes it, and may have what it lacks; "" if there is none."""
+    """Name of a file beside an MJCF that includes it and has what it lacks; "" if there is none."""
     for other in sorted(file.parent.glob("*.xml")):
-        with contextlib.suppress(OSError, ElementTree.ParseError):
+        with contextlib.suppress(OSError, ElementTree.ParseError, ValueError):
             included = (part.get("file") for part in ElementTree.parse(other).iter("include"))
-            if other != file and file.name in included:
+            if other != file and file.name in included and _compiled(str(other), frozenset(_sources(other))):
                 return other.name
     return ""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from support import urdfs
 from impactopt import FreeMass, ImpactProblem, InputError, Robot, Sole, SpringDamper, Striker
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.files.problem_file import problem_from_data
-from impactopt.robots.mjcf import read_mjcf
+from impactopt.robots.mjcf import compile_mjcf, read_mjcf
 from impactopt.simulation.mujoco_world import robot_bodies
 
 mujoco = pytest.importorskip("mujoco")
@@ -309,6 +310,12 @@ def test_a_part_of_a_scene_is_told_where_the_whole_is(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"scene\.xml includes this file: give that one"):
         read_mjcf(tmp_path / "robot.xml")
     assert read_mjcf(tmp_path / "scene.xml").model.nv == 1
+    (tmp_path / "scene.xml").write_text(
+        '<mujoco><include file="robot.xml"/><asset><mesh name="lost" file="lost.stl"/></asset></mujoco>'
+    )
+    with pytest.raises(InputError, match="'floor' not found") as lost:
+        read_mjcf(tmp_path / "robot.xml")
+    assert "includes" not in str(lost.value)
 
 
 def test_a_problem_file_can_name_an_mjcf(tree: Path) -> None:
@@ -336,3 +343,31 @@ def test_a_problem_file_can_name_an_mjcf(tree: Path) -> None:
         problem_from_data({**data, "robot": {**data["robot"], "urdf": "x"}}, where=tree.parent / "p")
     with pytest.raises(InputError, match="srdf belongs to urdf"):
         problem_from_data({**data, "robot": {**data["robot"], "srdf": "x"}}, where=tree.parent / "p")
+
+
+def test_a_file_is_compiled_again_only_if_one_of_its_sources_has_changed(tmp_path: Path) -> None:
+    """A draft reads its file ten times, and MuJoCo takes seconds for the hulls of large meshes."""
+    (tmp_path / "meshes").mkdir()
+    robot, arm, mesh = tmp_path / "robot.xml", tmp_path / "arm.xml", tmp_path / "meshes" / "link.obj"
+
+    def write(density: float, size: float) -> None:
+        arm.write_text(
+            f'<mujoco><worldbody><body name="arm"><joint name="hinge"/><geom type="mesh" mesh="link" '
+            f'density="{density}"/></body></worldbody></mujoco>'
+        )
+        corners = "".join(f"v {x} {y} {z}\n" for x, y, z in np.vstack([np.zeros(3), size * np.eye(3)]))
+        mesh.write_text(corners + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+
+    robot.write_text(
+        '<mujoco><compiler meshdir="meshes"/><asset><mesh name="link" file="link.obj"/></asset>'
+        '<include file="arm.xml"/></mujoco>'
+    )
+    write(1000.0, 0.1)
+    first = compile_mjcf(robot)
+    assert compile_mjcf(robot) is first
+    mass = read_mjcf(robot).model.inertias[1].mass
+    for density, size in ((2000.0, 0.1), (2000.0, 0.2)):
+        write(density, size)
+        os.utime(mesh, (1e9 * size, 1e9 * size))  # MuJoCo keeps meshes itself, by a time in seconds
+        factor = density / 1000.0 * (size / 0.1) ** 3
+        assert read_mjcf(robot).model.inertias[1].mass == pytest.approx(factor * mass, rel=1e-6)

@@ -41,8 +41,8 @@ _MAX_STEPS = 50
 _LARGEST_STEP = 0.3  # [rad] of a joint
 _CONVERGED = 1e-6  # [m, rad] error before the last step: quadratic convergence leaves about its square
 _DAMPING = 1e-12 * np.eye(6)  # a stretched leg's Jacobian is singular
-# Weights of the last one to four solutions that extrapolate them by a polynomial to the next instant. Four are
-# enough for one Newton step at almost all instants of a reference, three are not.
+# Weights of the last one to four solutions that extrapolate them by a polynomial to the next instant. From
+# four one Newton step mostly converges, from three it does not.
 _EXTRAPOLATION = ((1.0,), (-1.0, 2.0), (1.0, -3.0, 3.0), (-1.0, 4.0, -6.0, 4.0))
 
 

@@ -622,13 +622,15 @@ class Plan:
                 out[:, k] = wrench.reshape(len(wrench), -1, 6)[:, own.index(sole.name)]
         return out.reshape(len(wrench), -1)
 
-    def motion(self, reference: Trajectory, *, step: float = 1e-3, missed: bool = False) -> Motion:
+    def motion(
+        self, reference: Trajectory | None = None, *, step: float = CONTACT_STEP, missed: bool = False
+    ) -> Motion:
         """Expected motion of the robot's bodies, at the reference's instants from start to rest.
 
         In contact the contact force slows the robot below the servo's reference, so there the motion is the
         cubic Hermite interpolant of the states before and after contact, about every ``step`` [s].
 
-        reference : result of :meth:`trajectory`.
+        reference : result of :meth:`trajectory`; default: every millisecond.
         missed : nothing is hit, as in the reference; the motion from the planned contact on (before, it is as
             planned).
 
@@ -636,6 +638,7 @@ class Plan:
         ------
         InputError : the legs do not reach their soles.
         """
+        reference = reference or (self.missed_reference if missed else self.reference)
         t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
         within = sampled(t0, t1, step)
         # an impact without duration has t1 = t0

@@ -308,12 +308,8 @@ def sole_shares(found: Mapping[str, Any], told: Mapping[str, Any], name: str) ->
 
 def _planned(solution: Solution) -> list[Array]:
     """Configurations (k, nq) of the plan and of its missed blow."""
-    plan = solution.plan
-    ways = (False, True) if plan.abort is not None else (False,)
-    return [
-        plan.motion(plan.trajectory(step=EVERY, missed=missed), step=EVERY, missed=missed).q
-        for missed in ways
-    ]
+    ways = (False, True) if solution.plan.abort is not None else (False,)
+    return [solution.plan.motion(missed=missed).q for missed in ways]
 
 
 def _each(time: Array) -> NDArray[np.intp]:

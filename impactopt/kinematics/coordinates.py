@@ -41,8 +41,9 @@ _MAX_STEPS = 50
 _LARGEST_STEP = 0.3  # [rad] of a joint
 _CONVERGED = 1e-6  # [m, rad] error before the last step: quadratic convergence leaves about its square
 _DAMPING = 1e-12 * np.eye(6)  # a stretched leg's Jacobian is singular
-# weights of the last one, two or three solutions that extrapolate them by a polynomial to the next instant
-_EXTRAPOLATION = ((1.0,), (-1.0, 2.0), (1.0, -3.0, 3.0))
+# Weights of the last one to four solutions that extrapolate them by a polynomial to the next instant. From
+# four one Newton step mostly converges, from three it does not.
+_EXTRAPOLATION = ((1.0,), (-1.0, 2.0), (1.0, -3.0, 3.0), (-1.0, 4.0, -6.0, 4.0))
 
 
 class LegClosure:
@@ -100,7 +101,7 @@ class LegClosure:
     def follow(self, coordinates: Array, guess: Array) -> Iterator[tuple[Array, Array]]:
         """Configurations (nq,) and legs (nl,) along a continuous motion in coordinates (k, ny), one by one.
 
-        guess (nl,) : of the first legs. Those of the others are extrapolated from up to three before.
+        guess (nl,) : of the first legs. Those of the others are extrapolated from up to four before.
         """
         # All configurations without legs in one call: one by one they take as long as the legs.
         q = self._join(coordinates, np.zeros((len(coordinates), len(self._dependent))))
@@ -109,7 +110,7 @@ class LegClosure:
             weights = np.array(_EXTRAPOLATION[len(previous) - 1])
             legs = self._close(q[k], weights @ np.array(previous))
             # The caller's guess is no solution of an instant, so it is not extrapolated from.
-            previous = [*(previous if k else ())[-2:], legs]
+            previous = [*(previous if k else ())[-3:], legs]
             yield q[k], legs
 
     def jacobians(self, q: Array) -> Array:

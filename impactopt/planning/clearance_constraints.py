@@ -33,7 +33,7 @@ from impactopt.transcription.clearance import ClearanceKey, SeparatingDirection
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.layout import stack
 from impactopt.transcription.mesh import MoreNodes
-from impactopt.transcription.plan import Plan
+from impactopt.transcription.plan import COARSE_STEP, Plan
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
@@ -339,7 +339,6 @@ def _by_constraint(values: Array, old: ContactProgram, new: ContactProgram, fill
     return np.append(values[:others], [known.get(key, fill) for key in new.clearance_constraints])
 
 
-SAMPLE_STEP = 8e-3  # [s] between the instants at which a solution is checked
 # parts of a margin that a solution may lose without a violation: between nodes, and at them
 LOST_BETWEEN_NODES, LOST_AT_NODES = 0.5, 0.25
 MAX_RAISE = 0.02  # [m] of the clearance required at a node, in one round
@@ -384,7 +383,9 @@ def clearance_violations(
     approaches = list[tuple[Pair, _Approach]]()
     # The motion after a missed target exists only with an abort motion.
     for missed in (False, True) if plan.abort is not None else (False,):
-        motion = plan.motion(SAMPLE_STEP, missed=missed)
+        # the coarse references: loads and the replay of the contact use them, too
+        reference = plan.coarse_missed_reference if missed else plan.coarse_reference
+        motion = plan.motion(reference, step=COARSE_STEP, missed=missed)
         phase = np.where(missed, MISSED, motion.phase)
         at = Places.of(t.robot, motion.q, motion.travel, phase, motion.aside)
         approaches += [

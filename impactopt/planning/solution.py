@@ -228,7 +228,7 @@ class Solution(Solved):
         problem, bodies = self.problem, self.problem.bodies
         least, nearest, touches = np.inf, "", list[dict[str, Any]]()
         for missed in (False, True) if self.plan.abort is not None else (False,):
-            motion = self.plan.motion(missed=missed, reference=self._missed if missed else self.trajectory)
+            motion = self.plan.motion(self.missed_trajectory if missed else self.trajectory, missed=missed)
             phase = np.where(missed, MISSED, motion.phase)
             at = Places.of(problem.robot, motion.q, motion.travel, phase, motion.aside)
             found = bodies.survey(motion.time, at)

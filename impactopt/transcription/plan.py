@@ -35,9 +35,10 @@ from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
-# [s] Steps of the coarse reference, from which loads are taken, and of all references in contact, at most.
-# Loads change no faster than the nodes are apart, and inverse dynamics of every millisecond is slow.
-LOAD_STEP, CONTACT_STEP = 5e-3, 1e-3
+# [s] Steps of the coarse references, from which loads and clearances are taken, and of all references in
+# contact, at most. Loads change no faster than the nodes are apart, and inverse dynamics of every millisecond
+# is slow.
+COARSE_STEP, CONTACT_STEP = 5e-3, 1e-3
 MOMENT_COST = 10.0  # [1/m] weight of a wrench correction's moments relative to its forces
 
 
@@ -426,10 +427,15 @@ class Plan:
 
     @cached_property
     def coarse_reference(self) -> Trajectory:
-        """The servo's reference every `LOAD_STEP`, in contact every millisecond; InputError as of
+        """The servo's reference every `COARSE_STEP`, in contact every millisecond; InputError as of
         `reference`.
         """
-        return self.trajectory(step=LOAD_STEP, hold=LOAD_STEP)
+        return self.trajectory(step=COARSE_STEP, hold=COARSE_STEP)
+
+    @cached_property
+    def coarse_missed_reference(self) -> Trajectory:
+        """`missed_reference` with the steps of `coarse_reference`."""
+        return self.trajectory(step=COARSE_STEP, hold=COARSE_STEP, missed=True, known=self.coarse_reference)
 
     @cached_property
     def missed_reference(self) -> Trajectory:
@@ -617,47 +623,32 @@ class Plan:
         return out.reshape(len(wrench), -1)
 
     def motion(
-        self, step: float = 1e-3, *, missed: bool = False, reference: Trajectory | None = None
+        self, reference: Trajectory | None = None, *, step: float = CONTACT_STEP, missed: bool = False
     ) -> Motion:
-        """Expected motion of the robot's bodies, about every ``step`` [s] from start to rest.
+        """Expected motion of the robot's bodies, at the reference's instants from start to rest.
 
         In contact the contact force slows the robot below the servo's reference, so there the motion is the
-        cubic Hermite interpolant of the states before and after contact.
+        cubic Hermite interpolant of the states before and after contact, about every ``step`` [s].
 
-        missed : nothing is hit; the motion from the planned contact on (before, it is as planned).
-        reference : result of :meth:`trajectory`, if already computed, whose instants and postures are used.
+        reference : result of :meth:`trajectory`; default: every millisecond.
+        missed : nothing is hit, as in the reference; the motion from the planned contact on (before, it is as
+            planned).
 
         Raises
         ------
         InputError : the legs do not reach their soles.
         """
+        reference = reference or (self.missed_reference if missed else self.reference)
         t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
         within = sampled(t0, t1, step)
         # an impact without duration has t1 = t0
         during = self.closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
-        if reference is not None:
-            parts = [
-                (reference.time[k], reference.q[k]) for k in (reference.phase == 0, reference.phase == 2)
-            ]
-        else:
-            parts = []
-            for phase in (2,) if missed else (0, 2):
-                pieces = [piece for piece in self.pieces(missed=missed) if piece.phase == phase]
-                times = [sampled(p.start, p.start + p.spline.duration, step) for p in pieces]
-                times = [*(at[:-1] for at in times[:-1]), times[-1]]
-                postures = [
-                    self.closed(piece.sample(at)[0], self.problem.stance_coordinates[piece.number])
-                    for piece, at in zip(pieces, times, strict=True)
-                ]
-                parts.append((np.concatenate(times), np.concatenate(postures)))
-        if missed:
-            parts = [(np.zeros(0), np.zeros((0, self.problem.robot.nq))), parts[-1]]
-        (before, q_before), (after, q_after) = parts
-        time = np.concatenate([before, within, after])
+        before, after = (reference.phase == 0) & (not missed), reference.phase == 2
+        time = np.concatenate([reference.time[before], within, reference.time[after]])
         return Motion(
             time=time,
-            phase=np.repeat([0, 1, 2], [len(before), len(within), len(after)]),
-            q=np.concatenate([q_before, during, q_after]),
+            phase=np.repeat([0, 1, 2], [before.sum(), len(within), after.sum()]),
+            q=np.concatenate([reference.q[before], during, reference.q[after]]),
             travel=np.zeros(len(time)) if missed else self.travel(time),
             aside=np.zeros((len(time), 3)) if missed else self.aside(time),
         )
@@ -729,12 +720,11 @@ class Plan:
                 out[sole.name] = max(out.get(sole.name, 0.0), float(np.linalg.norm(speeds, axis=1).max()))
         return out
 
-    def closed(self, y: Array, coordinates: StanceCoordinates | None = None) -> Array:
-        """Configurations (k, nq) of independent coordinates (k, ny) along a continuous motion.
-
-        coordinates : by default those of the stance phase with the impact.
+    def closed(self, y: Array) -> Array:
+        """Configurations (k, nq) of independent coordinates (k, ny) along a continuous motion, in the stance
+        phase with the impact.
         """
-        c = coordinates or self.coordinates
+        c = self.coordinates
         return np.array([q for q, _ in c.leg_closure.follow(y, c.start_legs)]).reshape(len(y), c.model.nq)
 
     def margins(
@@ -842,15 +832,14 @@ def motion_loads(robot: Robot, reference: Trajectory, hit: PlannedCollision) -> 
 
 
 def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> list[DriveLoads]:
-    """Loads of a plan's motions every `LOAD_STEP`, including the abort motion, and of its collisions.
+    """Loads of a plan's motions every `COARSE_STEP`, including the abort motion, and of its collisions.
 
     hits : with the expected target, then with those of scenarios.
     """
     expected, *others = hits
     references = [plan.coarse_reference]
     if plan.abort is not None:
-        missed = plan.trajectory(step=LOAD_STEP, hold=LOAD_STEP, missed=True, known=references[0])
-        references.append(missed)
+        references.append(plan.coarse_missed_reference)
     out = [motion_loads(robot, reference, expected) for reference in references]
     still = np.zeros(robot.nv)
     return out + [strike_loads(robot, still, still, hit) for hit in others]

@@ -309,7 +309,7 @@ def sole_shares(found: Mapping[str, Any], told: Mapping[str, Any], name: str) ->
 def _planned(solution: Solution) -> list[Array]:
     """Configurations (k, nq) of the plan and of its missed blow."""
     ways = (False, True) if solution.plan.abort is not None else (False,)
-    return [solution.plan.motion(EVERY, missed=missed).q for missed in ways]
+    return [solution.plan.motion(missed=missed).q for missed in ways]
 
 
 def _each(time: Array) -> NDArray[np.intp]:

@@ -19,7 +19,7 @@ def test_no_mesh_is_in_another_from_start_to_rest_or_after_a_miss(punch: Solutio
     meshes = Meshes(punch.problem.robot, punch.problem.start_posture)
     assert meshes.known
     for missed in (False, True):
-        assert meshes.touching(punch.plan.motion(1e-3, missed=missed).q) == []
+        assert meshes.touching(punch.plan.motion(missed=missed).q) == []
 
 
 def test_the_meshes_know_what_is_in_each_other(punch: Solution) -> None:
@@ -36,7 +36,7 @@ def test_nor_when_it_is_bent(punch: Solution, aside: tuple[float, float, float])
     """So far that other bodies come near than those that the plan has rows for."""
     bent = punch.moved(point=punch.problem.point + aside)
     assert bent.status.usable, bent.result.message
-    assert Meshes(bent.problem.robot, bent.problem.start_posture).touching(bent.plan.motion(1e-3).q) == []
+    assert Meshes(bent.problem.robot, bent.problem.start_posture).touching(bent.plan.motion().q) == []
 
 
 def test_nor_in_another_problem() -> None:
@@ -46,7 +46,7 @@ def test_nor_in_another_problem() -> None:
     meshes = Meshes(solution.problem.robot, solution.problem.start_posture)
     assert meshes.known
     for missed in (False, True) if solution.plan.abort is not None else (False,):
-        assert meshes.touching(solution.plan.motion(1e-3, missed=missed).q) == []
+        assert meshes.touching(solution.plan.motion(missed=missed).q) == []
 
 
 def test_the_summary_says_so(punch: Solution) -> None:
@@ -66,7 +66,7 @@ def test_bodies_that_pass_through_each_other_are_told(punch: Solution) -> None:
     said = turned.clearance()
     assert said["clearance_mm"] < -30
     told = {frozenset((touch["one"], touch["other"])) for touch in said["contacts_besides"]}
-    found = Meshes(punch.problem.robot, punch.problem.start_posture).touching(turned.plan.motion(1e-3).q)
+    found = Meshes(punch.problem.robot, punch.problem.start_posture).touching(turned.plan.motion().q)
     assert len(told) > 1
     assert told <= {frozenset(name.removesuffix("_0") for name in pair) for pair in found}
 

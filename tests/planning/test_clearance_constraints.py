@@ -47,7 +47,7 @@ def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
 
 def hammer(solution: Solution, time: float) -> Array:
     """Where the hammer's face is at a time [s]."""
-    motion, robot = solution.plan.motion(1e-3), solution.problem.robot
+    motion, robot = solution.plan.motion(), solution.problem.robot
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, motion.q[int(np.abs(motion.time - time).argmin())])
     return np.array(data.oMf[robot.model.getFrameId("striker:hammer")].translation)

@@ -327,7 +327,7 @@ def test_only_what_is_switched_off_is_not_kept_apart(biped_transcription: Transc
 def passing(problem: ImpactProblem, plan: Plan) -> float:
     """The least distance [m] of any two bodies on a plan's way by coal alone, < 0 in each other."""
     bodies, robot = problem.bodies, problem.robot
-    motion, data = plan.motion(4e-3), robot.model.createData()
+    motion, data = plan.motion(plan.trajectory(step=4e-3)), robot.model.createData()
     least = np.inf
     pieces = bodies.links.of_joint
     for q, travel in zip(motion.q, motion.travel, strict=True):

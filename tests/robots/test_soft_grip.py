@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,16 @@ def _inertia(robot: Robot, q: Any) -> Any:
 
 def _whole(upper: Any) -> Any:
     return np.triu(upper) + np.triu(upper, 1).T
+
+
+def test_the_page_of_soft_grips_gives_the_natural_frequency_of_its_hammer() -> None:
+    """By the parallel axis theorem, from the tool alone."""
+    (hammer,), soft = planar_arm().tools, grip()
+    lever = np.cross(soft.axis, hammer.center - soft.point)
+    inertia = soft.axis @ hammer.inertia @ soft.axis + hammer.mass * lever @ lever
+    frequency = np.sqrt(soft.stiffness / inertia)
+    page = Path(__file__).resolve().parents[2] / "docs" / "howto" / "gears.md"
+    assert f"sqrt(k / J): {frequency:.0f} rad/s here" in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("frame", ["wrist", "elbow"])

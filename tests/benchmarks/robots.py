@@ -227,7 +227,7 @@ def _targets(problem: ImpactProblem, rng: np.random.Generator) -> Iterator[tuple
         normal = rng.standard_normal(3) if face is None else at.rotation @ face.normal
         if at.translation[0] < FRONT or (at.translation[2] < 0.1 and normal[2] < 0):
             continue
-        for impact in strength.at(q, [normal / np.linalg.norm(normal)]):
+        for impact in strength.at(q[None], normal[None] / np.linalg.norm(normal)):
             if not impact.impulse:  # a limit of position holds the arm
                 continue
             found = strike_problem(robot, name, impact, behind=BEHIND, given=given)

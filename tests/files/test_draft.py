@@ -595,7 +595,8 @@ def test_where_no_plan_is_found_motions_may_last_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As where the guess from the joints' speeds is too short."""
-    monkeypatch.setattr("impactopt.files.draft.drafting.duration", lambda *given: [0.05, 0.2])
+    short = {"swing": (0.05, 0.2), "follow": (0.05, 0.2)}
+    monkeypatch.setattr("impactopt.files.draft.drafting.durations", lambda *given: short)
     problem = _problem(tmp_path, urdfs.arm().replace('velocity="4.0"', 'velocity="3.9"'), planned=True)
     assert problem.swing.duration[1] == 0.4
     assert solve(problem).status.usable

@@ -195,10 +195,11 @@ def test_one_touch_has_no_plan_and_the_order_that_has_one_is_named() -> None:
 # ---- nails that jump ahead of the hammer
 
 
-@pytest.fixture(scope="module")
-def rattled() -> Solution:
+@pytest.fixture(scope="module", params=[(1e7, 200.0), (1e8, 1000.0)], ids=["1e7", "1e8"])
+def rattled(request: pytest.FixtureRequest) -> Solution:
     problem = load_problem("arm_planar")
-    law = KelvinVoigt(stiffness=1e7, damping=200.0)
+    stiffness, damping = request.param
+    law = KelvinVoigt(stiffness=stiffness, damping=damping)
     return solve(
         dataclasses.replace(problem, law=law, touches=3, terms=(*problem.terms, GearLoad(enabled=False)))
     )
@@ -213,7 +214,7 @@ def test_a_nail_starts_in_its_first_touch_and_stops_in_its_last(rattled: Solutio
 
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_its_touches_are_those_of_replays(rattled: Solution, engine: str) -> None:
-    """One touch would have 34 % less peak force."""
+    """One touch would have 34 and 40 % less peak force."""
     replay, hit = rattled.validate(engine=engine), rattled.plan.collision
     assert hit.peak_force == pytest.approx(replay.peak_force, rel=0.03)
     assert replay.impulse == pytest.approx(rattled.impulse, rel=5e-3)

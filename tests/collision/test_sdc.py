@@ -258,9 +258,10 @@ def test_each_term_against_an_independent_integration(effects):
 
 @pytest.mark.parametrize("speed", [0.4, 1.0, 3.0])
 @pytest.mark.parametrize("gain", [20.0, 150.0, 300.0])
-def test_impulse_over_speeds_and_gains(speed, gain):
+@pytest.mark.parametrize("seed", [2, 3])
+def test_impulse_over_postures_speeds_and_gains(speed, gain, seed):
     robot, sdc = robot_named("talos"), default_sdc("talos")
-    q, v, torque = situation(robot, seed=2, speed=speed)
+    q, v, torque = situation(robot, seed=seed, speed=speed)
     kd = np.full(robot.n, gain)
     gains = {"kd": kd, "kp": 30.0 * kd}
     expected = reference(sdc, q, v, torque, **gains)

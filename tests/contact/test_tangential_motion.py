@@ -295,7 +295,7 @@ def test_a_plan_is_what_both_engines_replay(friction: ContactFriction) -> None:
     fixed = dataclasses.replace(plan.collision, tangential_velocity=None)
     assert slide(problem, plan) < slide(problem, dataclasses.replace(plan, collision=fixed))
     held = dataclasses.replace(problem, friction=dataclasses.replace(friction, moves_target=False))
-    done = simulate_pinocchio(problem.robot, way, scene_of(held), until=0.01)
+    done = simulate_pinocchio(problem.robot, way, scene_of(held), until=until)
     assert "tangential_speed_m_s" not in done.outcome and not done.target_aside.size
 
 

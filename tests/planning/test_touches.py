@@ -59,7 +59,7 @@ def chopped(request: pytest.FixtureRequest) -> Solution:
     return solve(stiff(stiffness, touches=touches))
 
 
-@pytest.fixture(scope="module", params=[(KelvinVoigt, 1e7), (SpringDamper, 1e7)])
+@pytest.fixture(scope="module", params=[(KelvinVoigt, 1e7), (KelvinVoigt, 1e8), (SpringDamper, 1e7)])
 def swung(request: pytest.FixtureRequest) -> Solution:
     law, stiffness = request.param
     return solve(stiff(law=law(stiffness=stiffness, damping=50.0)))
@@ -161,7 +161,7 @@ def test_a_servo_of_much_damping_is_followed_too(chopped: Solution) -> None:
         follow_contact(
             robot, chopped.plan.reference, scene_of(p), step=step, until=duration, longest=duration
         )
-        for step in (duration / 10, 4e-6)
+        for step in (duration / 10, 1e-6)
     )
     assert coarse.impulse == pytest.approx(fine.impulse, rel=5e-3)
 
@@ -197,8 +197,8 @@ def test_one_touch_has_no_plan_and_the_order_that_has_one_is_named() -> None:
 
 @pytest.fixture(scope="module", params=[(1e7, 200.0), (1e8, 1000.0)], ids=["1e7", "1e8"])
 def rattled(request: pytest.FixtureRequest) -> Solution:
-    problem = load_problem("arm_planar")
     stiffness, damping = request.param
+    problem = load_problem("arm_planar")
     law = KelvinVoigt(stiffness=stiffness, damping=damping)
     return solve(
         dataclasses.replace(problem, law=law, touches=3, terms=(*problem.terms, GearLoad(enabled=False)))

@@ -180,13 +180,13 @@ def rows_of(result: Robustness) -> list[tuple[Any, ...]]:
 
 def test_one_worker_and_two_give_the_same_numbers(still: tuple[Any, Any]) -> None:
     told: list[tuple[int, int]] = []
-    given: dict[str, Any] = {"draws": 2, "step": STEP / 2}
+    given: dict[str, Any] = {"draws": 3, "step": STEP / 2}
     one = robustness(*still, 1.0, **given, workers=1)
     two = robustness(*still, 1.0, **given, workers=2, progress=lambda done, of: told.append((done, of)))
     assert np.isfinite(one.impulse).all()
     assert rows_of(one) == rows_of(two)
-    assert one.perturbations == two.perturbations == tuple(draw_perturbations(2))
-    assert told == [(1, 2), (2, 2)]
+    assert one.perturbations == two.perturbations == tuple(draw_perturbations(3))
+    assert told == [(1, 3), (2, 3), (3, 3)]
 
 
 def test_what_is_drawn_reaches_the_replay(still: tuple[Any, Any]) -> None:

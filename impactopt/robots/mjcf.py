@@ -21,6 +21,7 @@ import pinocchio as pin
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
+from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, missing_package
 from impactopt.robots.build import ROOT, existing, friction, set_friction
 from impactopt.robots.description import Description, Tie, between
@@ -302,7 +303,7 @@ def compile_mjcf(path: str | PathLike[str]) -> Any:
         raise missing_package("a robot from an MJCF", "mujoco", "validate") from error
     try:
         return _compiled(file, frozenset(_sources(Path(file))))
-    except ValueError as error:
+    except (OSError, ValueError) as error:
         whole = _including(Path(file))
         fix = f"; {whole} includes this file: give that one" if whole else ""
         raise InputError(f"MJCF {file}: {error}{fix}") from error
@@ -321,7 +322,7 @@ def _sources(file: Path) -> Iterator[tuple[Path, object]]:
     while left:
         done |= left
         for source in left:
-            text = source == file or source.suffix == ".xml"
+            text = source == file or source.suffix.lower() in (".xml", ".mjcf")
             content = source.read_bytes() if text else source.stat().st_mtime_ns
             yield source, content
             with contextlib.suppress(ElementTree.ParseError):
@@ -329,7 +330,7 @@ def _sources(file: Path) -> Iterator[tuple[Path, object]]:
                     folders.update(part.get(key, ".") for key in ("assetdir", "meshdir", "texturedir"))
                     names.add(part.get("file", "."))
         named = {file.parent / folder / name for folder in folders for name in names}
-        left = {source for source in named - done if source.is_file()}
+        left = {source for source in named - done if is_plain_file(source)}
 
 
 def _including(file: Path) -> str:

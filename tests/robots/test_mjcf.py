@@ -345,23 +345,32 @@ def test_a_problem_file_can_name_an_mjcf(tree: Path) -> None:
         problem_from_data({**data, "robot": {**data["robot"], "srdf": "x"}}, where=tree.parent / "p")
 
 
+def test_a_mesh_with_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text(
+        f'<mujoco><asset><mesh name="link" file="{"a" * 5000}.stl"/></asset><worldbody><body>'
+        '<joint name="hinge"/><geom type="mesh" mesh="link"/></body></worldbody></mujoco>'
+    )
+    with pytest.raises(InputError, match=r"robot\.xml: .*aaa"):
+        read_mjcf(tmp_path / "robot.xml")
+
+
 def test_a_file_is_compiled_again_only_if_one_of_its_sources_has_changed(tmp_path: Path) -> None:
     """A draft reads its file ten times, and MuJoCo takes seconds for the hulls of large meshes."""
     (tmp_path / "meshes").mkdir()
-    robot, arm, mesh = tmp_path / "robot.xml", tmp_path / "arm.xml", tmp_path / "meshes" / "link.obj"
+    robot, arm, mesh = tmp_path / "robot.xml", tmp_path / "arm.mjcf", tmp_path / "meshes" / "link.obj"
 
     def write(density: float, size: float) -> None:
-        arm.write_text(
-            f'<mujoco><worldbody><body name="arm"><joint name="hinge"/><geom type="mesh" mesh="link" '
+        text = (
+            '<mujoco><asset><mesh name="link" file="link.obj"/></asset>'
+            f'<worldbody><body name="arm"><joint name="hinge"/><geom type="mesh" mesh="link" '
             f'density="{density}"/></body></worldbody></mujoco>'
         )
+        if not arm.exists() or arm.read_text() != text:
+            arm.write_text(text)
         corners = "".join(f"v {x} {y} {z}\n" for x, y, z in np.vstack([np.zeros(3), size * np.eye(3)]))
         mesh.write_text(corners + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
 
-    robot.write_text(
-        '<mujoco><compiler meshdir="meshes"/><asset><mesh name="link" file="link.obj"/></asset>'
-        '<include file="arm.xml"/></mujoco>'
-    )
+    robot.write_text('<mujoco><compiler meshdir="meshes"/><include file="arm.mjcf"/></mujoco>')
     write(1000.0, 0.1)
     first = compile_mjcf(robot)
     assert compile_mjcf(robot) is first

@@ -6,11 +6,12 @@ the sections of problem files are made from them (`impactopt.files.sections.valu
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import inspect
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -175,6 +176,59 @@ def check_numbers(instance: Any) -> None:
         if 0 < number < 1 / MOST and not description.allows(-1.0):
             zero = "0, or " if description.allows(0.0) else ""
             raise InputError(f"{name}: {number:g}; give {zero}a number of at least {1 / MOST:g}")
+
+
+def with_symbols(instance: Any) -> Any:
+    """Copy of a law or a target with a CasADi symbol ``self.<name>`` in the place of each of its fields."""
+    copied = copy.copy(instance)
+    for name in numbers_of(instance):
+        object.__setattr__(copied, name, ca.SX.sym(f"self.{name}"))
+    return copied
+
+
+def expressions_of(
+    where: str, call: str, method: Callable[[], Any], names: Sequence[object] | None = None
+) -> list[Any]:
+    """Expressions that a method of a law or a target gives, called with CasADi symbols.
+
+    where, call : the method and its arguments, for messages.  method : calls it.
+    names : of the list that it has to give; None: it gives one expression, without a list.
+
+    Raises
+    ------
+    InputError : the call fails, or gives anything else.
+    """
+    try:
+        given = method()
+        listed = isinstance(given, (list, tuple))
+        right = given is not None and listed == (names is not None)
+        found = [ca.SX(part) for part in (given if listed else [given])] if right else []
+    except Exception as error:
+        raise InputError(
+            f"{where}: cannot be called with CasADi expressions as {call}, with casadi.fmax and "
+            f"casadi.if_else in the place of max and if: {error}"
+        ) from error
+    wanted = "one expression" if names is None else f"a list of {len(names)}: {', '.join(map(str, names))}"
+    if not right:
+        kind = "nothing" if given is None else "a list" if listed else "no list"
+        raise InputError(f"{where}: {call} gives {kind}; give {wanted}")
+    count = sum(part.numel() for part in found)
+    if count != (1 if names is None else len(names)) or len(found) != count:
+        raise InputError(f"{where}: {call} gives {count} expressions; give {wanted}")
+    return found
+
+
+def check_parameters_taken(instance: Any, expressions: Iterable[Any]) -> None:
+    """InputError unless expressions of a law or a target take its fields from the methods' `parameters`.
+
+    expressions : of the methods of `with_symbols(instance)`, all of them.
+    """
+    used = {symbol.name() for symbol in ca.symvar(ca.SX(ca.veccat(*expressions)))}
+    if missing := [name for name in numbers_of(instance) if name not in used or f"self.{name}" in used]:
+        raise InputError(
+            f"{type(instance).__name__} does not take {', '.join(missing)} from the argument `parameters` of "
+            'its methods, so changing it would do nothing: write parameters["..."], not self'
+        )
 
 
 def text_of(expressions: Sequence[Any]) -> str:

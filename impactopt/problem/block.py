@@ -52,8 +52,8 @@ def make_block(
     return BlockExpression(
         ca.vertcat(*z),
         ca.vertcat(*p),
-        ca.vertcat(*out.values()),
-        {k: int(v.numel()) for k, v in out.items()},
+        ca.SX(ca.vertcat(*out.values())),
+        {k: int(ca.SX(v).numel()) for k, v in out.items()},
         (*first, *stages),
         lanes,
     )

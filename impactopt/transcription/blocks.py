@@ -8,7 +8,7 @@ ydot = y'/T and yddot = y''/T^2. Lists of z, p and out are in the order of the v
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -387,7 +387,10 @@ def extra_blocks(
     # the package's first, so that a name that is taken is reported of the user's class
     for source in sorted(sources, key=lambda s: not type(s).__module__.startswith("impactopt.")):
         where = f"{type(source).__name__}.blocks"
-        for name, block in source.blocks(problem, c).items():
+        made = source.blocks(problem, c)
+        if not isinstance(made, Mapping):
+            raise InputError(f"{where} gives {made!r}; give a dict of blocks by name, {{}} for none")
+        for name, block in made.items():
             if not isinstance(block, (BlockExpression, BlockRecipe)):
                 raise InputError(
                     f"{where}: {name!r} is {block!r}; give what impactopt.problem.block.make_block makes"

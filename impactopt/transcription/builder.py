@@ -97,9 +97,14 @@ class Builder:
 
     def append(self, block: Block) -> int:
         """Add a block that is made already; returns the index of its first output."""
-        at = sum(b.count * b.n_out for b in self.blocks)
+        at = self.n_outputs
         self.blocks.append(block)
         return at
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs of all blocks so far."""
+        return sum(b.count * b.n_out for b in self.blocks)
 
     def lift(
         self,

@@ -10,10 +10,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from impactopt.errors import InputError
 from impactopt.problem.objectives import Objective
 from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
+from impactopt.problem.terms.base import kind_of
 from impactopt.solvers.program import Determined
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
@@ -226,14 +228,36 @@ class ContactProgram(ABC):
         for term in terms:
             # the parts have the constraints of the other terms
             if type(term).add_constraints is not Term.add_constraints:
-                since = len(self.constraints.origins)
+                since, before = len(self.constraints.origins), self.builder.n_outputs
                 term.add_constraints(self)
                 self.constraints.measured(since, term.name, term.unit)
+                if not kind_of(term, Term).__module__.startswith("impactopt."):
+                    self._check_own(type(term).__name__, since, before)
         self.objectives = quantities(self, objectives)
         self._objective = assemble(self.layout, self.objectives, self._prices())
         # each round's set of clearance constraints is added to a copy of this builder
         self._without_clearance = self.builder
         self.program = self._assembled()
+
+    def _check_own(self, kind: str, since: int, before: int) -> None:
+        """InputError unless a user's own term has added constraints, with all outputs of the blocks it added.
+
+        kind : its class.  since, before : numbers of constraints, and of outputs of blocks, before it.
+        """
+        if len(self.constraints.origins) == since:
+            raise InputError(
+                f"{kind}.add_constraints adds no constraint with a finite bound, so a plan ignores the term: "
+                "call program.constraints.add with a bound, or leave the term out; whole_motion = True "
+                "leaves it out of strikes"
+            )
+        added = np.arange(before, self.builder.n_outputs)
+        unused = np.setdiff1d(added, np.concatenate([*self.constraints.outputs, *self.constraints.unbounded]))
+        if unused.size:
+            raise InputError(
+                f"{kind}.add_constraints: {unused.size} of the {added.size} outputs of its blocks are in no "
+                f"constraint, such as number {unused[0] - before} from the first that add_block returned: an "
+                "instance's outputs follow those of the instance before"
+            )
 
     def _assembled(self) -> StructuredProgram:
         objective, quadratic, linear = self._objective

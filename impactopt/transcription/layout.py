@@ -335,6 +335,8 @@ class Constraints:
     A constraint is  lower <= out[output] + affine <= upper,  with one output of a block (index -1: none) and
     an affine expression. Each call of :meth:`add` appends an entry to the lists, and as many origins as
     constraints.
+
+    unbounded : outputs of constraints that were dropped, as they had no finite bound.
     """
 
     outputs: list[Index] = field(default_factory=list)
@@ -342,6 +344,7 @@ class Constraints:
     lower: list[Array] = field(default_factory=list)
     upper: list[Array] = field(default_factory=list)
     origins: list[ConstraintOrigin] = field(default_factory=list)
+    unbounded: list[Index] = field(default_factory=list)
 
     def copy(self) -> Constraints:
         """Copy to which other constraints can be added."""
@@ -389,17 +392,23 @@ class Constraints:
         n = len(components)
         lo = np.broadcast_to(np.asarray(lower, dtype=float), (n,))
         hi = np.broadcast_to(np.asarray(upper, dtype=float), (n,))
-        # what a term leaves unlimited has infinite bounds
-        keep = np.flatnonzero(np.isfinite(lo) | np.isfinite(hi))
-        if not keep.size:
-            return
+        if np.isnan([lo, hi]).any():
+            raise InputError(f"{term}: a bound of its constraints is NaN; give numbers, or inf for no bound")
+        if outputs is None and affine is None:
+            raise InputError(f"{term}: constraints of nothing; give outputs of a block, or affine, or both")
         out = np.full(n, -1) if outputs is None else np.atleast_1d(np.asarray(outputs, dtype=np.intp))
         lin = Affine.zeros(n) if affine is None else affine
         for what, count in (("outputs", out.size), ("affine", lin.size)):
             if count != n:
                 raise InputError(f"{term}: {what} are {count}, components {n}; give as many of both")
+        # what a term leaves unlimited has infinite bounds
+        bounded = np.isfinite(lo) | np.isfinite(hi)
+        keep = np.flatnonzero(bounded)
         if keep.size < n:
+            self.unbounded.append(out[~bounded])
             out, lin, lo, hi = out[keep], lin[keep], lo[keep], hi[keep]
+        if not keep.size:
+            return
         self.outputs.append(out)
         self.affine.append(lin)
         self.lower.append(lo)

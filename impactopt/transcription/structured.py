@@ -368,6 +368,11 @@ class StructuredProgram:
         output_of = np.concatenate([np.zeros(0, dtype=np.intp), *constraints.outputs])
         self._nonlinear = np.flatnonzero(output_of >= 0)  # constraints with an output
         self._of_nonlinear = output_of[self._nonlinear]  # and that output
+        if (beyond := self._nonlinear[self._of_nonlinear >= self._out_offset[-1]]).size:
+            raise InputError(
+                f"{self.origins[beyond[0]]!s}: there is no output {output_of[beyond[0]]} of a block, only "
+                f"{self._out_offset[-1]}; add_block returns the number of a block's first output"
+            )
         outputs, uses = np.unique(self._of_nonlinear, return_counts=True)
         if (uses > 1).any():
             # Each output has one multiplier and one place in the scatter-adds, `constraint_of`.

@@ -502,6 +502,21 @@ class Baked(ContactLaw):
         return self.stiffness * penetration
 
 
+class HalfBaked(Baked):
+    """A law that does take it, in one of its branches."""
+
+    def branch(self, penetration, rate, compressing, parameters=None):
+        p = self.parameters if parameters is None else parameters
+        return (p["stiffness"] if compressing else self.stiffness) * penetration
+
+
+class Parting(HuntCrossley):
+    """A law with two expressions for the end of contact."""
+
+    def separation(self, penetration, rate, parameters=None):
+        return ca.vertcat(penetration, rate)
+
+
 class Undecorated(ContactLaw):
     def branch(self, penetration, rate, compressing, parameters=None):
         return penetration
@@ -524,7 +539,11 @@ def test_a_law_is_refused_when_it_is_made(branch, message):
 
 
 def test_a_law_that_does_not_take_its_numbers_as_inputs_is_refused():
-    with pytest.raises(InputError, match=r"Baked\.branch does not take stiffness .* `parameters`"):
-        Baked(stiffness=1e4).formula()
+    with pytest.raises(InputError, match=r"Baked does not take stiffness .* `parameters`"):
+        Baked(stiffness=1e4)
+    with pytest.raises(InputError, match=r"HalfBaked does not take stiffness .* `parameters`"):
+        HalfBaked(stiffness=1e4)
+    with pytest.raises(InputError, match=r"separation\(.*\) gives 2 expressions; give one expression"):
+        Parting(stiffness=1e4, dissipation=0.0)
     with pytest.raises(InputError, match="Undecorated is no dataclass: write @dataclass"):
         _ = Undecorated().parameters

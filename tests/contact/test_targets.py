@@ -133,8 +133,80 @@ def test_formulas_tell_targets_apart_but_not_their_numbers():
     class Renamed(FreeMass):
         results = ("swiftness",)
 
-    formulas |= {Watched(mass=1.0).formula(), Renamed(mass=1.0).formula()}
-    assert len(formulas) == len(TARGETS) + 2
+    class Sledge(FreeMass):
+        def tangential_mass(self, parameters=None):
+            return 2.0 * super().tangential_mass(parameters)
+
+    class Swung(FreeMass):
+        def speed_before(self, parameters=None):
+            return 0.5 * super().speed_before(parameters)
+
+    formulas |= {kind(mass=1.0).formula() for kind in (Watched, Renamed, Sledge, Swung)}
+    assert len(formulas) == len(TARGETS) + 4
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sprung(Target):
+    """A mass on a spring, whose methods the cases below replace."""
+
+    mass: float
+    stiffness: float
+
+    n_states = 2
+    results = ("speed",)
+
+    def velocity(self, state, parameters=None):
+        return state[0]
+
+    def derivative(self, state, force, parameters=None):
+        p = parameters or self.parameters
+        return [(force - p["stiffness"] * state[1]) / p["mass"], state[0]]
+
+    def energy(self, state, parameters=None):
+        p = parameters or self.parameters
+        return 0.5 * (p["mass"] * state[0] ** 2 + p["stiffness"] * state[1] ** 2)
+
+    def result(self, state, parameters=None):
+        return [state[0]]
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"derivative": lambda t, z, f, p=None: [f / p["mass"]]}, "derivative.* gives 1 .*give a list of 2"),
+        (
+            {"derivative": lambda t, z, f, p=None: f / p["mass"]},
+            "derivative.* gives no list; give a list of 2",
+        ),
+        ({"result": Target.result}, "result.* gives 0 expressions; give a list of 1: speed"),
+        ({"result": lambda t, z, p=None: z[0]}, "result.* gives no list; give a list of 1: speed"),
+        ({"velocity": lambda t, z, p=None: z}, "velocity.* gives a list; give one expression"),
+        ({"velocity": lambda t, z, p=None: ca.vertcat(*z)}, "velocity.* gives 2 expressions; give one"),
+        ({"energy": lambda t, z, p=None: None}, "energy.* gives nothing; give one expression"),
+        ({"energy": lambda t, z, p=None: max(z[0], 0.0)}, "as energy.*casadi.fmax"),
+        ({"energy": lambda t, z, p=None: t.mass * z[0] ** 2}, "does not take mass from .*`parameters`"),
+        ({"typical": (1.0,)}, "typical has 1 numbers"),
+    ],
+)
+def test_a_target_whose_methods_give_what_they_should_not_is_refused_when_it_is_made(changes, message):
+    assert Sprung(mass=1.0, stiffness=2.0).derivative([0.5, 1.0], 3.0) == [1.0, 0.5]
+    with pytest.raises(InputError, match=f"Own.*{message}"):
+        type("Own", (Sprung,), changes)(mass=1.0, stiffness=2.0)
+
+
+def test_a_targets_methods_are_checked_once_for_each_class():
+    calls = []
+
+    class Counted(FreeMass):
+        def energy(self, state, parameters=None):
+            calls.append(self)
+            return super().energy(state, parameters)
+
+    Counted(mass=1.0)
+    checked = len(calls)
+    assert checked
+    Counted(mass=2.0)
+    assert len(calls) == checked
 
 
 def test_a_target_without_switches_and_results_has_none():

@@ -223,6 +223,39 @@ def test_a_subclass_of_one_of_the_packages_is_that_one(arm_transcription: Transc
         program(Stare(**look), Gaze(**look), effort=Effort())
 
 
+def test_constraints_that_would_be_ignored_are_refused(arm_transcription: Transcription) -> None:
+    def add(program: Any, **changes: Any) -> None:
+        at = program.add_block("ceiling", [slots for _, slots in program.swing_spots()], np.zeros(0))
+        ours = {"outputs": at + np.arange(len(program.swing_spots())), "upper": 2.0} | changes
+        program.constraints.add(term="own", components=["hand"] * len(ours["outputs"]), **ours)
+
+    class Own(Ceiling):
+        def __init__(self, changes: dict[str, Any] | None) -> None:
+            super().__init__(height=1.0)
+            object.__setattr__(self, "changes", changes)
+
+        def add_constraints(self, program: Any) -> None:
+            if self.changes is not None:
+                add(program, **self.changes)
+
+    for changes, words in (
+        (None, "Own.add_constraints adds no constraint"),
+        ({"upper": np.inf}, "Own.add_constraints adds no constraint with a finite bound"),
+        ({"upper": np.nan}, "own: a bound of its constraints is NaN"),
+        ({"outputs": np.array([0])}, r"Own.add_constraints: \d+ of the \d+ outputs of its blocks are in no"),
+    ):
+        with pytest.raises(InputError, match=words):
+            changed(arm_transcription, terms=(Own(changes),))
+    assert changed(arm_transcription, terms=(Own({}),)).program.m > arm_transcription.program.m
+
+    class Far(Pushes):
+        def quantity(self, program: Any) -> Any:
+            return program.lift("far", np.array([10**6]))[0]
+
+    with pytest.raises(InputError, match="far, far: there is no output 1000000 of a block"):
+        changed(arm_transcription, objectives=(Impulse(), Far(weight=1.0)))
+
+
 def test_what_a_program_would_know_nothing_of_is_refused(arm_transcription: Transcription) -> None:
     @dataclass(frozen=True, kw_only=True)
     class Silent(Term):

@@ -10,12 +10,23 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
-from impactopt.contact.fields import Described, Parameters, check_numbers, choose, numbers_of, text_of
+from impactopt.contact.fields import (
+    Described,
+    Parameters,
+    check_numbers,
+    check_parameters_taken,
+    choose,
+    expressions_of,
+    numbers_of,
+    text_of,
+    with_symbols,
+)
 from impactopt.errors import InputError
 
 # [m] penetrations at which both branches are compared at rate zero, and relative difference allowed there
@@ -50,16 +61,16 @@ class ContactLaw(Described, ABC):
         name, phases = type(self).__name__, {True: "compression", False: "restitution"}
         if "_symbolic" not in vars(type(self)):  # whatever the numbers are, so once for each class
             x, rate, symbols = ca.SX.sym("x"), ca.SX.sym("rate"), {p: ca.SX.sym(p) for p in self.parameters}
+            # a CustomLaw's functions get all parameters in any case
+            own_fields = dataclasses.is_dataclass(type(self))
+            law, found = with_symbols(self) if own_fields else self, []
             for compressing, phase in phases.items():
-                try:
-                    size = ca.SX(self.branch(x, rate, compressing, symbols)).numel()
-                except Exception as error:
-                    raise InputError(
-                        f"{name}: {phase}: cannot be called with CasADi expressions as {call}, with "
-                        f"casadi.fmax and casadi.if_else in the place of max and if: {error}"
-                    ) from error
-                if size != 1:
-                    raise InputError(f"{name}: {phase}: gives {size} expressions; one force is wanted")
+                force = partial(law.branch, x, rate, compressing, symbols)
+                found += expressions_of(f"{name}: {phase}", call, force)
+            end = partial(law.separation, x, rate, symbols)
+            found += expressions_of(name, "separation(penetration, rate, parameters)", end)
+            if own_fields:
+                check_parameters_taken(self, found)
             type(self)._symbolic = True
         for depth in _DEPTHS:
             there, back = (float(self.branch(depth, 0.0, compressing)) for compressing in phases)
@@ -106,17 +117,7 @@ class ContactLaw(Described, ABC):
         """Both branches and `separation` as text in generic symbols, from which cache keys are made."""
         names = {name: ca.SX.sym(name) for name in self.parameters}
         x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
-        forces = [self.branch(x, rate, c, names) for c in (True, False)]
-        used = {symbol.name() for symbol in ca.symvar(ca.SX(ca.vertcat(*forces)))}
-        unused = [name for name in names if name not in used]
-        # a CustomLaw's functions get all parameters in any case
-        own_fields = dataclasses.is_dataclass(type(self))
-        if unused and own_fields:
-            raise InputError(
-                f"{type(self).__name__}.branch does not take {', '.join(unused)} from its argument "
-                '`parameters`, so changing it would do nothing: write parameters["..."], not self'
-            )
-        compression, restitution = (text_of([force]) for force in forces)
+        compression, restitution = (text_of([self.branch(x, rate, c, names)]) for c in (True, False))
         return compression, restitution, text_of([self.separation(x, rate, names)])
 
     def force(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:

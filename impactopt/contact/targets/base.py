@@ -6,11 +6,21 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import casadi as ca
 
-from impactopt.contact.fields import Described, Parameters, check_numbers, numbers_of, text_of
+from impactopt.contact.fields import (
+    Described,
+    Parameters,
+    check_numbers,
+    check_parameters_taken,
+    expressions_of,
+    numbers_of,
+    text_of,
+    with_symbols,
+)
 from impactopt.contact.laws.base import ContactLaw
 from impactopt.errors import InputError
 
@@ -22,8 +32,8 @@ class Target(Described, ABC):
 
     To write one, make a frozen dataclass whose fields are its parameters, and implement the methods below.
     They have to be smooth, except where one of `switches` changes its sign. `state` is a column of `n_states`
-    numbers or CasADi symbols; it is zero when contact begins. Fields with
-    `impactopt.contact.fields.about` as metadata are checked when a target is made.
+    numbers or CasADi symbols; it is zero when contact begins. When a target is made, its methods are called
+    with CasADi expressions, and fields with `impactopt.contact.fields.about` as metadata are checked.
 
     Attributes
     ----------
@@ -49,9 +59,34 @@ class Target(Described, ABC):
     at_once: ClassVar[bool] = False
     stays: ClassVar[bool] = False
     met_again: ClassVar[bool] = False
+    _checked: ClassVar[bool] = False  # True in the class of a target whose methods give what they should
 
     def __post_init__(self) -> None:
         check_numbers(self)
+        if "_checked" not in vars(type(self)):  # whatever the numbers are, so once for each class
+            self._check_methods()
+            type(self)._checked = True
+
+    def _check_methods(self) -> None:
+        """InputError unless the methods take CasADi expressions, give as many as they should, and take all
+        fields from their argument `parameters`.
+        """
+        name, target = type(self).__name__, with_symbols(self)
+        state, force, numbers = self._symbols()
+        rates = [f"the rate of state[{i}]" for i in range(self.n_states)]
+        for method, call, arguments, names in (
+            ("velocity", "(state, parameters)", (state, numbers), None),
+            ("derivative", "(state, force, parameters)", (state, force, numbers), rates),
+            ("energy", "(state, parameters)", (state, numbers), None),
+            ("result", "(state, parameters)", (state, numbers), self.results),
+        ):
+            expressions_of(name, method + call, partial(getattr(target, method), *arguments), names)
+        if self.typical and len(self.typical) != self.n_states:
+            raise InputError(
+                f"{name}: typical has {len(self.typical)} numbers; give {self.n_states}, one for each of the "
+                "state"
+            )
+        check_parameters_taken(self, [x for part in target._expressions().values() for x in part])
 
     @property
     def turns(self) -> bool:
@@ -160,12 +195,23 @@ class Target(Described, ABC):
 
     def formula(self) -> tuple[str, ...]:
         """All expressions of the target as text in generic symbols, from which cache keys are made."""
-        numbers = {name: ca.SX.sym(name) for name in self.parameters}
+        made = [f"{name}: {text_of(expressions)}" for name, expressions in self._expressions().items()]
+        return (*made, f"results: {', '.join(self.results)}")
+
+    def _symbols(self) -> tuple[list[Any], Any, dict[str, Any]]:
+        """Generic symbols of the state, the force and the parameters."""
         state = [ca.SX.sym(f"state_{i}") for i in range(self.n_states)]
-        force = ca.SX.sym("force")
+        return state, ca.SX.sym("force"), {name: ca.SX.sym(name) for name in self.parameters}
+
+    def _expressions(self) -> dict[str, list[Any]]:
+        """All expressions of the target in generic symbols."""
+        state, force, numbers = self._symbols()
+        across = self.tangential_mass(numbers)
         parts = {
             "derivative": self.derivative(state, force, numbers),
             "velocity": [self.velocity(state, numbers)],
+            "speed before": [self.speed_before(numbers)],
+            "tangential mass": [] if across is None else [across],
             "energy": [self.energy(state, numbers)],
             "switches": self.switches(state, force, numbers),
             "result": self.result(state, numbers),
@@ -179,8 +225,7 @@ class Target(Described, ABC):
                 *self.invariant(state, force, k, numbers),
                 *self.reserve(state, force, k, numbers),
             ]
-        made = [f"{name}: {text_of(expressions)}" for name, expressions in parts.items()]
-        return (*made, f"results: {', '.join(self.results)}")
+        return parts
 
 
 def scaled_numbers(

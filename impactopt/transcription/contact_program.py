@@ -212,7 +212,15 @@ class ContactProgram(ABC):
         """Largest contact force [N] of the expected collision, as a variable."""
         assert isinstance(self.expected, Collision)
         forces = self.expected.f
-        at = self.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
+        y, y1, _ = self.contact_state
+
+        def parameters(problem: ImpactProblem) -> Array:
+            before = float(problem.target.speed_before())
+            return np.array([*problem.normal, *problem.law.parameters.values(), before])
+
+        slots = [y, y1, self.contact_T, *(forces[i] for i in range(forces.count))]
+        at = self.add_block("peak", [slots], parameters(self.problem))
+        self.builder.follow(lambda b: b.block("peak").take_parameters(parameters(b.problem)))
         return self.lift("peak force", np.array([at]))[0] * PEAK_SCALE
 
     def squares(self, group: Group) -> Quantity:

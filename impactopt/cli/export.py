@@ -87,9 +87,10 @@ def export(
             typer.echo(printable(str(path)))
         if cost is not None:
             meets = f"; it meets other bodies {cost['touches']} times" if cost["touches"] else ""
+            change = 100 * (cost["impulse_Ns"] / cost["planned_impulse_Ns"] - 1)
             typer.echo(
-                f"smoothed: {cost['impulse_Ns']:.3g} N s in our replay, of {cost['planned_impulse_Ns']:.3g} "
-                f"planned{meets}"
+                f"smoothed: {cost['impulse_Ns']:.3g} N s in our replay, {abs(change):.1f} % "
+                f"{'less' if change < 0 else 'more'} than the {cost['planned_impulse_Ns']:.3g} planned{meets}"
             )
         if to in NEXT:
             typer.echo(printable(NEXT[to].format(directory=directory)))

@@ -155,7 +155,7 @@ class Program:
             self.worth += drives.worth
             self.scales |= drives.scales
             self.missing += drives.missing
-            rows, worth = worth_pieces(problem, self.blows[0])
+            rows, worth = worth_pieces(problem, self.blows[0], self._approach)
             self.worth += worth
             self.rows += [*rows, *speed_pieces(problem, self.blows[0], self.ways[1])]
             self.worth += price_pieces(problem, [*self.ways, *self.stands], self.blows)
@@ -300,6 +300,10 @@ class Program:
                 (incidence.name, "contact", tangents, -incidence.speed, incidence.speed),
             ]
             self.rows.append(Piece.of(value, rows))
+
+    def _approach(self, v: Variables) -> float:
+        """Speed of the striker along the normal at contact [m/s]."""
+        return float(self.problem.normal @ self.robot.striking(*self.state_at_contact(v))[1])
 
     def _slide(self) -> None:
         """How far across the target the striker is as contact ends."""

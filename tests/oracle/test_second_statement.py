@@ -24,6 +24,8 @@ from impactopt import (
     GearLoad,
     GroundForce,
     KelvinVoigt,
+    Objective,
+    PeakForce,
     Phase,
     ReferenceRange,
     Scenario,
@@ -274,9 +276,11 @@ def test_of_a_tool_in_a_soft_grip() -> None:
     check_rows(transcribed(dataclasses.replace(p, robot=robot, terms=(*p.terms, GearLoad()))))
 
 
-def test_of_effort() -> None:
+@pytest.mark.parametrize("objective", [Effort(weight=0.02), PeakForce(weight=0.001)], ids=lambda o: o.name)
+def test_of_an_objective_that_is_not_linear(objective: Objective) -> None:
+    """The peak force has the force at first touch of the damped law."""
     p = load_problem(PROBLEMS / "arm_planar.toml")
-    check_rows(transcribed(dataclasses.replace(p, objectives=(*p.objectives, Effort(weight=0.02)))))
+    check_rows(transcribed(dataclasses.replace(p, objectives=(*p.objectives, objective))))
 
 
 def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned) -> None:

@@ -87,12 +87,17 @@ def speed_pieces(problem: ImpactProblem, blow: Blow, follow: Way) -> list[Piece]
     return found
 
 
-def worth_pieces(problem: ImpactProblem, blow: Blow) -> tuple[list[Piece], list[Piece]]:
-    """Rows of what objectives lift, and minus what they are worth."""
+def worth_pieces(
+    problem: ImpactProblem, blow: Blow, approach: Callable[[Variables], float]
+) -> tuple[list[Piece], list[Piece]]:
+    """Rows of what objectives lift, and minus what they are worth.
+
+    approach : speed of the striker along the normal at contact [m/s].
+    """
     rows, worth = [], []
     for objective in problem.objectives:
         factor = objective.weight if objective.cost else -objective.weight
-        found = _lifted(problem, blow, objective)
+        found = _lifted(problem, blow, approach, objective)
         if found is None:
             continue
         quantity, row = found
@@ -106,7 +111,7 @@ def worth_pieces(problem: ImpactProblem, blow: Blow) -> tuple[list[Piece], list[
 
 
 def _lifted(
-    problem: ImpactProblem, blow: Blow, objective: Objective
+    problem: ImpactProblem, blow: Blow, approach: Callable[[Variables], float], objective: Objective
 ) -> tuple[Callable[[Variables], float], Piece | None] | None:
     """What an objective weighs, and the row that makes a variable of it if there is one."""
     last, target = blow.end[-1], problem.target
@@ -124,7 +129,10 @@ def _lifted(
         name, unit = "peak force", PEAK
 
         def source(v: Variables) -> float:
-            g = np.array([blow.get(v, "contact force", i)[0] for i in range(len(blow.stages))]) / PEAK
+            rate = approach(v) - float(target.speed_before())
+            first = float(problem.law.branch(0.0, rate, True, blow.law))  # of a damper, at once
+            forces = [first, *(blow.get(v, "contact force", i)[0] for i in range(len(blow.stages)))]
+            g = np.array(forces) / PEAK
             return float(np.sum(g**9) / (np.sum(g**8) + 1e-12))
 
     elif isinstance(objective, Penetration):

@@ -273,10 +273,24 @@ def export_of(
 def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, dict[str, float]]:
     """The plan with a smoothed reference and without its abort motion, which would begin with a jump; limits
     and impulse of the smoothed motion in a replay.
+
+    Raises
+    ------
+    InputError : no motion satisfies the limits, or it does not hit the target.
     """
     within = Smoothness(acceleration=limits[0], jerk=limits[1])
     reference = smoothed(planned.reference, planned.problem, within)
     replayed = simulate(planned.problem, reference)
+    if not replayed.impulse:
+        swing = planned.reference.phase == 0
+        time, own = planned.reference.time[swing], planned.reference.a[swing, -planned.problem.robot.n :]
+        jerk = np.diff(own, axis=0) / np.diff(time)[:, None]
+        most, fastest = (float(f"{np.abs(x).max():.2g}") for x in (own, jerk))
+        raise InputError(
+            f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "
+            f"does not hit the target; the plan's swing has up to {most:g} rad/s^2 and {fastest:g} rad/s^3: "
+            "give larger limits, or plan with [terms.joint_acceleration]"
+        )
     smoothing = {
         "acceleration_rad_s2": within.acceleration,
         "jerk_rad_s3": within.jerk,

@@ -26,7 +26,7 @@ class PeakForce(Objective):
     not among these forces.
     """
 
-    name: ClassVar[str] = "peak force"
+    name: ClassVar[str] = "smooth peak force"
     unit: ClassVar[str] = "N"
     contact: ClassVar[bool] = True
     weight: float = field(default=0.01, metadata=WEIGHT)

@@ -25,6 +25,7 @@ from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.refinement import refine as refine_with
 from impactopt.planning.solution import Solution, program_on, solution_of
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.violation import Measure
 from impactopt.solvers.predictor import ActiveSystem, Change, Offset, Prediction, Predictor
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.transcription import Transcription, statement_of
@@ -162,7 +163,9 @@ Array = NDArray[np.float64]
 # Half of a central difference, over the parameter's size. The least durations of a contact's phases come from
 # the impact of a point mass, integrated with a relative error of 1e-6, which dominates with a smaller step.
 _DIFFERENCE_STEP = 1e-2
-_MIN_PRICE = 1e-6  # smaller shadow prices count as zero
+# Shadow prices below this fraction of the objective, per unit of the bound, do not matter: the objective of a
+# solution is off by `complementarity_tolerance` (1e-6) for each of some ten active constraints.
+_MIN_PRICE = 1e-5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,7 +190,8 @@ class Sensitivity:
 
     parameter, value : its name and value.  impulse : d impulse / d parameter [N s / unit].
     objective : d (weighted sum of the objectives, less the prices on motion) / d parameter.
-    binding : active constraints and bounds, by falling shadow price.
+    binding : active constraints and bounds, by falling shadow price; not those whose multiplier is only the
+        barrier's.
     """
 
     parameter: str
@@ -262,24 +266,29 @@ def _binding(family: ParametricProgram) -> tuple[Binding, ...]:
     """Active inequalities and bounds with a shadow price, by falling price."""
     t, system = family.program, family.system
     program, out = t.program, list[Binding]()
-    inequality = program.g_lower < program.g_upper
-    for i in np.flatnonzero(system.constraints * inequality):
-        # A multiplier's sign is the side of its bound; relaxing outward never costs.
-        price, origin = abs(float(system.y[i])), t.constraints.origins[int(i)]
-        measure = origin.measure
-        # the program's constraints are scaled: ``factor`` leads back to the unit of the bound
+    least = _MIN_PRICE * max(abs(program.objective(system.x)), 1.0)
+
+    def add(name: str, multiplier: float, measure: Measure | None, scale: float = 1.0) -> None:
+        # the program's constraints and variables are scaled: ``factor`` leads back to the unit of the bound
         unit, factor = ("1", 1.0) if measure is None else (measure.unit, measure.factor)
         if measure is not None and measure.over is not None:
             factor /= max(float(measure.over.evaluate(system.x)[0]), measure.least)
-        if price > _MIN_PRICE:
-            out.append(Binding(row=origin.describe(system.x, 0.0)[0], price=price / factor, unit=unit))
-    free = program.x_lower < program.x_upper
-    for j in np.flatnonzero(system.bounds * free):
-        price = abs(float(system.z[j]))
-        if price > _MIN_PRICE:
-            group = next(g for g in t.layout.groups.values() if g.offset <= j < g.offset + g.count * g.size)
-            scale = float(group.scale[(int(j) - group.offset) % group.size])
-            out.append(Binding(row=f"bound of {t.layout.name(int(j))}", price=price / scale, unit="SI unit"))
+        # A multiplier's sign is the side of its bound; relaxing outward never costs.
+        if (price := abs(multiplier) / (scale * factor)) > least:
+            out.append(Binding(row=name, price=price, unit=unit))
+
+    # At an interior point slack x multiplier is the barrier, for inactive constraints too: a multiplier that
+    # is smaller than its slack is the barrier's. Both are scaled to order one.
+    for i in np.flatnonzero((program.g_lower < program.g_upper) & (system.soft_constraints < 1.0)):
+        origin = t.constraints.origins[int(i)]
+        if system.constraints[i]:
+            add(origin.describe(system.x, 0.0)[0], system.y[i], origin.measure)
+    for j in np.flatnonzero((program.x_lower < program.x_upper) & (system.soft_bounds < 1.0)):
+        group = t.layout.group_of(int(j))
+        k = (int(j) - group.offset) % group.size
+        measure = group.measures[k] if group.measures else None
+        if system.bounds[j]:
+            add(f"bound of {t.layout.name(int(j))}", system.z[j], measure, float(group.scale[k]))
     return tuple(sorted(out, key=lambda binding: -binding.price))
 
 

@@ -84,6 +84,7 @@ class ActiveSystem:
     ----------
     x, y, z : of the solution, as of `impactopt.solvers.program.SolverResult`.
     constraints (m,), bounds (n,) : side at which each constraint and variable is active; 1 for equalities.
+    soft_constraints (m,), soft_bounds (n,) : softness of the active ones, S; 0 for others.
     """
 
     def __init__(
@@ -92,8 +93,8 @@ class ActiveSystem:
         """proximal : added to the diagonal of H, so that a step moves variables little that hardly matter."""
         self.x, self.y, self.z = x, y, z
         g = program.constraints(x)
-        self.constraints, self._soft_constraints = _active_sides(g, program.g_lower, program.g_upper, y)
-        self.bounds, self._soft_bounds = _active_sides(x, program.x_lower, program.x_upper, z)
+        self.constraints, self.soft_constraints = _active_sides(g, program.g_lower, program.g_upper, y)
+        self.bounds, self.soft_bounds = _active_sides(x, program.x_lower, program.x_upper, z)
         n = program.n
         self._constraints, self._bounds = np.flatnonzero(self.constraints), np.flatnonzero(self.bounds)
         # A = [J of the active constraints; unit rows of the active bounds].
@@ -106,7 +107,7 @@ class ActiveSystem:
         H = sp.csc_array(program.hessian(x, 1.0, y))
         if proximal:
             H = sp.csc_array(H + proximal * sp.eye_array(n))
-        soft = np.concatenate([self._soft_constraints[self._constraints], self._soft_bounds[self._bounds]])
+        soft = np.concatenate([self.soft_constraints[self._constraints], self.soft_bounds[self._bounds]])
         # A dx - (slack / multiplier) dy = -off: the linearization of slack x multiplier = mu
         self._matrix = sp.csc_array(sp.block_array([[H, A.T], [A, sp.diags_array(-soft)]]))
         self._factors: dict[float, Any] = {}
@@ -134,9 +135,9 @@ class ActiveSystem:
             dual=np.asarray(program.gradient(x) + program.jacobian(x).T @ point.y + point.z),
             # Softness times the multiplier's change: 0 at the solution itself, as its slack is no residual.
             constraints=_bound_residual(g, program.g_lower, program.g_upper, self.constraints)
-            - self._soft_constraints * (point.y - self.y),
+            - self.soft_constraints * (point.y - self.y),
             variables=_bound_residual(x, program.x_lower, program.x_upper, self.bounds)
-            - self._soft_bounds * (point.z - self.z),
+            - self.soft_bounds * (point.z - self.z),
         )
 
     def step(self, offset: Offset) -> Change:

@@ -76,7 +76,9 @@ class Builder:
 
     def duration(self, name: str, bounds: tuple[float, float], scale: float) -> Group:
         """Add a duration [s] as a variable."""
-        return self.layout.add(name, 1, 1, lower=bounds[0], upper=bounds[1], scale=scale, labels=["T"])
+        limits = {"lower": bounds[0], "upper": bounds[1]}
+        seconds = Measure("s", 1.0, "off")
+        return self.layout.add(name, 1, 1, scale=scale, labels=["T"], measure=seconds, **limits)
 
     def block(self, name: str) -> Block:
         """First block of this name."""
@@ -126,7 +128,9 @@ class Builder:
         """
         size = len(outputs)
         labels = labels or ([name] if size == 1 else [f"{name} {k}" for k in range(size)])
-        group = self.layout.add(name, 1, size, lower=lower, upper=upper, scale=scale, labels=labels)
+        group = self.layout.add(
+            name, 1, size, lower=lower, upper=upper, scale=scale, labels=labels, measure=measure
+        )
         self.constraints.add(
             term=term or name,
             place=place,

@@ -45,6 +45,7 @@ from impactopt.transcription.layout import (
     along,
     by_leg,
     determined,
+    millimetres,
     percent,
     rates,
 )
@@ -256,13 +257,19 @@ class Collision(ContactParameters):
         by_peak = any(isinstance(o, PeakForce) for o in p.objectives)
         self.holds = not (p.target.turns or p.order or by_peak)
         least, most = self._least_force(guarded), np.where(self.forceless, 0.0, np.inf)[:, None]
-        self.f = add("contact force", len(p.strikers), scale=FORCE_SCALE, lower=least, upper=most)
+        newtons = Measure("N", 1.0, "off")
+        self.f = add(
+            "contact force", len(p.strikers), scale=FORCE_SCALE, lower=least, upper=most, measure=newtons
+        )
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
         self.xt = add("target travel", 1, labels=["target"])
         bent = 3 * len(p.strikers) if len(friction_parameters(p)) > 2 else 0
         # in a gap the bristles are not bent, by their bounds, so that each touch begins with unbent ones
         most = np.where(self.apart, 0.0, np.inf)[:, None]
-        self.bristles = add("bristle deflection", bent, scale=DEPTH_SCALE, lower=-most, upper=most)
+        depth = millimetres("off")
+        self.bristles = add(
+            "bristle deflection", bent, scale=DEPTH_SCALE, lower=-most, upper=most, measure=depth
+        )
         self.tangential = add("target tangential velocity", 3 * moves_target(p.friction))
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)

@@ -16,7 +16,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact_guess import natural_durations
-from impactopt.transcription.layout import Affine, Array, Group, Place
+from impactopt.transcription.layout import Affine, Array, Group, Place, percent
 from impactopt.transcription.mesh import CollocationPoint
 
 # Least durations of contact phases, as fractions of that of compression or restitution (`contact_duration`).
@@ -167,8 +167,9 @@ class Coasting(NamedTuple):
 def add_coasting(b: Builder, rates: dict[str, Any] | None = None) -> Coasting:
     """Add the variables of the reference.  rates : bounds of the rate at contact."""
     limit, names = b.limits.torque.fraction, b.robot.joint_names
+    torque: dict[str, Any] = {"lower": -limit, "upper": limit, "measure": percent("over its limit")}
     return Coasting(
-        b.layout.add("feed-forward at contact", 1, b.robot.n, lower=-limit, upper=limit, labels=names),
+        b.layout.add("feed-forward at contact", 1, b.robot.n, labels=names, **torque),
         b.layout.add("rate at contact", 1, b.ny, labels=b.coordinates.labels, **(rates or {})),
         _add_gains(b),
     )
@@ -181,7 +182,8 @@ def _add_gains(b: Builder) -> Group:
     # as a logarithm a factor stays positive, and halving is as far as doubling
     least, largest = np.log([gain.factor for gain in chosen]).T
     labels = [", ".join(gain.joints) for gain in chosen]
-    return b.layout.add(GAINS, 1, len(chosen), lower=least, upper=largest, labels=labels)
+    bounds: dict[str, Any] = {"lower": least, "upper": largest, "measure": percent("off")}
+    return b.layout.add(GAINS, 1, len(chosen), labels=labels, **bounds)
 
 
 class Contact(NamedTuple):

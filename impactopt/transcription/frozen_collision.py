@@ -75,7 +75,9 @@ class InstantImpact:
             return b.layout.add(prefix + name, 1, size, **options)
 
         self.du = add("change of rate", b.ny, labels=c.labels)
-        self.impulse_group = add("impulse", 1, lower=1e-3, scale=10.0)  # > 0, as the block divides by it
+        of_impulse = Measure("N s", 1.0, "off")
+        # > 0, as the block divides by it
+        self.impulse_group = add("impulse", 1, lower=1e-3, scale=10.0, measure=of_impulse)
         # [N s, N m s]: the weight for 0.05 s
         scale = 0.05 * b.limits.wrench_scale
         self.w = add("impulsive sole wrench", b.nw, **{**b.limits.of_wrenches, "scale": scale})

@@ -182,6 +182,8 @@ class Group:
     """Variables of one kind: ``count`` vectors of length ``size``, from ``offset`` on in the decision vector.
 
     Physical values are the solver's times ``scale`` (size,).
+
+    measures (size,) : of the bounds, for messages; () if there is none.
     """
 
     name: str
@@ -190,6 +192,7 @@ class Group:
     size: int
     scale: Array  # (size,)
     labels: tuple[str, ...]
+    measures: tuple[Measure, ...] = ()
 
     def index(self, k: int) -> NDArray[np.intp]:
         if not -self.count <= k < self.count:
@@ -229,8 +232,11 @@ class Layout:
         upper: ArrayLike = np.inf,
         scale: ArrayLike = 1.0,
         labels: Sequence[str] | None = None,
+        measure: Measure | Sequence[Measure] | None = None,
     ) -> Group:
         """Append ``count`` vectors of ``size`` variables; bounds (physical) broadcast to (count, size).
+
+        measure : of the bounds, one for all components, or one for each.
 
         Raises
         ------
@@ -240,7 +246,8 @@ class Layout:
             raise InputError(f"there are variables {name!r} already: give others a name of their own")
         s = np.broadcast_to(np.asarray(scale, dtype=float), (size,)).copy()
         tags = tuple(labels) if labels is not None else tuple(str(i) for i in range(size))
-        group = Group(name, self.n, count, size, s, tags)
+        measures = (measure,) * size if isinstance(measure, Measure) else tuple(measure or ())
+        group = Group(name, self.n, count, size, s, tags, measures)
         self.groups[name] = group
         for store, bound in ((self._lower, lower), (self._upper, upper)):
             store.append((np.broadcast_to(np.asarray(bound, dtype=float), (count, size)) / s).ravel())
@@ -270,12 +277,17 @@ class Layout:
             shape = group.count, group.size
             store[k] = (np.broadcast_to(np.asarray(bound, dtype=float), shape) / group.scale).ravel()
 
-    def name(self, j: int) -> str:
-        for g in self.groups.values():
-            k = j - g.offset
-            if 0 <= k < g.count * g.size:
-                return f"{g.name}[{k // g.size}], {g.labels[k % g.size]}"
+    def group_of(self, j: int) -> Group:
+        """Group of variable j."""
+        for group in self.groups.values():
+            if 0 <= j - group.offset < group.count * group.size:
+                return group
         raise IndexError(j)
+
+    def name(self, j: int) -> str:
+        g = self.group_of(j)
+        k = j - g.offset
+        return f"{g.name}[{k // g.size}], {g.labels[k % g.size]}"
 
 
 Index = NDArray[np.intp]
@@ -463,11 +475,17 @@ class Limits:
         force, moment = Measure("N", self.weight, "off"), Measure("N m", self.weight * LEVER, "off")
         self.unbalanced = [force if name in "xyz" else moment for name in DIRECTIONS[: c.base]]
         self.wrench_scale = self.weight * np.array([1, 1, 1, LEVER, LEVER, LEVER] * len(c.legs))
-        self.of_y: dict[str, Any] = {"lower": self.y_lower, "upper": self.y_upper, "labels": c.labels}
+        self.of_y: dict[str, Any] = {
+            "lower": self.y_lower,
+            "upper": self.y_upper,
+            "labels": c.labels,
+            "measure": along(c.labels, "off"),
+        }
         self.of_legs: dict[str, Any] = {
             "lower": self.legs_lower,
             "upper": self.legs_upper,
             "labels": c.leg_labels,
+            "measure": degrees("off"),
         }
         wrench_labels = [f"{leg.end} {k}" for leg in c.legs for k in WRENCH]
         self.of_wrenches: dict[str, Any] = {"scale": self.wrench_scale, "labels": wrench_labels}

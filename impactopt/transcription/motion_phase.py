@@ -232,10 +232,9 @@ class MotionPhase:
                 REST: (self._last - 1, self._last),
                 COASTING: (self._last,),
             }[str(ends)]
-            names, box = b.coordinates.labels[:6], {k: limits.of_y[k][:6] for k in ("lower", "upper")}
-            count = len(self._drifting)
-            self.drift = b.layout.add(f"{self.kind} base control point", count, 6, labels=names, **box)
-            self.bend = b.layout.add(f"{self.kind} base acceleration", nodes, 6, labels=names)
+            of_base = {name: values[:6] for name, values in limits.of_y.items()}
+            self.drift = b.layout.add(f"{self.kind} base control point", len(self._drifting), 6, **of_base)
+            self.bend = b.layout.add(f"{self.kind} base acceleration", nodes, 6, labels=of_base["labels"])
 
     def control(self, j: int) -> Affine:
         """Control point j = 0 .. N+2 of the spline.

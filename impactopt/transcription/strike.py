@@ -20,7 +20,7 @@ from impactopt.transcription.contact_conditions import add_balance, add_conditio
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
-from impactopt.transcription.layout import Affine, Array, Measure, Place, along, by_leg
+from impactopt.transcription.layout import Affine, Array, Measure, Place, along, by_leg, rates
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.motion_phase import add_nodes, at_node
 from impactopt.transcription.objective import Prices, wrench_prices
@@ -50,7 +50,7 @@ class StrikeTranscription(ContactProgram):
         # the base has no rate limit of its own
         fastest = np.full(b.ny, np.inf)
         fastest[c.base :] = limits.rate_limit[c.independent]
-        coasting = add_coasting(b, {"lower": -fastest, "upper": fastest})
+        coasting = add_coasting(b, {"lower": -fastest, "upper": fastest, "measure": rates(c.labels)})
         # T = 1 s, so that y' is the rate; no acceleration, as at the end of a swing
         still, one = Affine.zeros(b.ny), Affine.constant(1.0)
         state = ContactState(self.y[0], coasting.u0[0], still, one, self.legs[0], self.w[0])

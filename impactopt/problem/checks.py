@@ -45,7 +45,7 @@ INSTANT = ("rigid", "virtual-mass")  # collision models without duration
 # collision models, the cheapest first; "auto" is the cheapest that is accurate enough
 COLLISIONS = (*INSTANT, "sdc-paper", "sdc", "full", "auto")
 MOST_FREEZES = 64
-LONGEST_CONTACT = 100.0  # [s]
+LONGEST_CONTACT = 10.0  # [s]
 MOST_ELEMENTS = 100  # of compression or restitution: two are accurate to a few per mille
 MOST_TOUCHES = 4
 # Smaller mobilities along the normal, over the largest in any direction, count as zero.

@@ -92,7 +92,9 @@ def check_second(problem: Any) -> None:
             raise InputError(f"{type(thing).__name__} is for one striker: leave it out, or the second one")
 
 
-SHORTEST, LONGEST = 1e-3, 1e3  # [s] of a phase: no servo is faster, and no impact is prepared for longer
+# [s] of a phase: no servo is faster; an impact's motion takes about a second, and more is milliseconds
+SHORTEST, LONGEST = 1e-3, 60.0
+LONGEST_WAIT = 10.0  # [s] until an abort motion
 # intervals of a phase: with the middles of the intervals, a swing of 1 s has nodes at 4 kHz, as a fast servo
 FINEST = 2000
 STEEPEST = 1e3  # grading
@@ -116,9 +118,10 @@ class Phase:
         given: Any = (self.duration,) * 2 if one else self.duration
         duration = check_array("a phase's duration [s]", given, (None,)).tolist()
         if len(duration) != 2 or not SHORTEST <= duration[0] <= duration[1] <= LONGEST:
+            doubt = "; is it in milliseconds?" if max(duration, default=0.0) > LONGEST else ""
             raise InputError(
                 f"a phase's duration [s] is a number of {SHORTEST:g} to {LONGEST:g} or (shortest, longest), "
-                f"not {shortened(str(self.duration))}"
+                f"not {shortened(str(self.duration))}{doubt}"
             )
         object.__setattr__(self, "duration", tuple(duration))
         object.__setattr__(self, "grading", check_number("a phase's grading", self.grading))
@@ -155,6 +158,7 @@ class Scenario(Described):
             "time from the planned contact to the abort motion",
             unit="s",
             above=0,
+            most=LONGEST_WAIT,
         ),
     )
     torque: float = field(
@@ -188,7 +192,8 @@ class Scenario(Described):
             if isinstance(f.default, bool):
                 check_kind(f"{where}: {f.name}", value, bool)
             else:
-                description.checked(f"{where}: {f.name}", value)
+                unit = f" [{description.unit}]" if description.unit else ""
+                description.checked(f"{where}: {f.name}{unit}", value)
         changed = [f.name for f in fields(self)[1:] if getattr(self, f.name) != f.default]
         unused = [name for name in changed if name not in ("missing", "abort_after", "capture_margin")]
         if self.missing and unused:

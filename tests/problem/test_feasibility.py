@@ -81,7 +81,7 @@ def test_a_fixed_base_is_not_asked_for_balance() -> None:
 def test_numbers_that_look_like_another_unit_are_doubted() -> None:
     problem = load_problem("arm_planar")
     assert unusual(problem) == []
-    late, heavy = Phase(duration=800.0), FreeMass(mass=3000.0)
+    late, heavy = Phase(duration=40.0), FreeMass(mass=3000.0)
     (said,) = unusual(dataclasses.replace(problem, swing=late))
     assert said.startswith("[swing] duration_s") and "milliseconds" in said
     (said,) = unusual(dataclasses.replace(problem, target=heavy))

@@ -779,6 +779,23 @@ def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
     assert load_problem(tmp_path / "arm.toml").robot.torque_limit[1] == 30.0
 
 
+def test_an_mjcf_with_weightless_fingers_is_bolted(tmp_path: Path) -> None:
+    """It was read as one that floats, which refused the gravcomp of its fingers before they were locked."""
+    pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    path.write_text("""
+        <mujoco><default><geom type="capsule" size=".03" fromto="0 0 0 0 0 .3"/></default><worldbody>
+        <body name="upper"><joint name="shoulder" axis="0 1 0" range="-100 100"/><geom/>
+        <body name="lower" pos="0 0 .3"><joint name="elbow" axis="0 1 0" range="-140 140"/><geom/>
+        <body name="finger" pos="0 0 .3" gravcomp="1"><geom size=".01" fromto="0 0 0 0 0 .05"/>
+        <joint name="claw" type="slide" axis="0 1 0" range="0 .05"/></body></body></body></worldbody>
+        <actuator><motor joint="shoulder" ctrlrange="-90 90"/><motor joint="elbow" ctrlrange="-30 30"/>
+        </actuator></mujoco>
+    """)
+    drafted = draft_robot(path, mjcf=True)
+    assert not drafted.robot.floating and set(drafted.locked) == {"claw"}
+
+
 def test_a_joint_may_have_a_links_name(tmp_path: Path) -> None:
     same = urdfs.arm().replace('joint name="elbow"', 'joint name="elbow_link"')
     same = same.replace('joint name="slide_0"', 'joint name="claw_0"')

@@ -785,10 +785,11 @@ def test_an_mjcf_with_weightless_fingers_is_bolted(tmp_path: Path) -> None:
     path = tmp_path / "arm.xml"
     path.write_text("""
         <mujoco><default><geom type="capsule" size=".03" fromto="0 0 0 0 0 .3"/></default><worldbody>
-        <body name="upper"><joint name="shoulder" axis="0 1 0" range="-100 100"/><geom/>
+        <body name="base"><geom/><body name="upper" pos="0 0 .3">
+        <joint name="shoulder" axis="0 1 0" range="-100 100"/><geom/>
         <body name="lower" pos="0 0 .3"><joint name="elbow" axis="0 1 0" range="-140 140"/><geom/>
         <body name="finger" pos="0 0 .3" gravcomp="1"><geom size=".01" fromto="0 0 0 0 0 .05"/>
-        <joint name="claw" type="slide" axis="0 1 0" range="0 .05"/></body></body></body></worldbody>
+        <joint name="claw" type="slide" axis="0 1 0" range="0 .05"/></body></body></body></body></worldbody>
         <actuator><motor joint="shoulder" ctrlrange="-90 90"/><motor joint="elbow" ctrlrange="-30 30"/>
         </actuator></mujoco>
     """)

@@ -757,6 +757,18 @@ def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: floa
     assert ("rise" in read_toml(draft.text)["robot"].get("locked_rad", {})) == locked
 
 
+def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
+    """Fetch's arm was to strike 2.4 m beside it, where no swing of a second takes its base."""
+    text = urdfs.arm().replace('<parent link="base"/>', '<parent link="mobile"/>', 1)
+    links = [urdfs.link(name, 4.0, (0.1, 0.1, 0.1), (0, 0, 0)) for name in ("turning", "mobile")]
+    far = (-999999.0, 999999.0)
+    steer = urdfs.joint("steer", "base", "turning", "0 0 1", (0, 0, 0.2), far)
+    roll = urdfs.joint("roll", "turning", "mobile", "1 0 0", (0, 0, 0), far, kind="prismatic")
+    (tmp_path / "robot.urdf").write_text(text.replace("</robot>", f"{''.join(links)}{steer}{roll}</robot>"))
+    locked = draft_robot(tmp_path / "robot.urdf").locked
+    assert {joint for joint, why in locked.items() if why == "drives a base"} == {"steer", "roll"}
+
+
 def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"

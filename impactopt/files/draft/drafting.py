@@ -17,7 +17,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import seen_pieces
-from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.errors import InputError, counted
 from impactopt.files.draft.default_drives import DOUBT
 from impactopt.files.draft.hits import Hit, hits
@@ -241,8 +241,10 @@ def _hardest(robot: Robot, arm: Arm, q: Array, targets: list[Hit]) -> tuple[list
     was none.
     """
     why = ""
-    # edgewise last: for an arm of few joints, which cannot turn the link's face to its direction of motion
-    for edgewise, hit in product((False, True), targets):
+    # edgewise last: for an arm of few joints, which cannot turn the link's face to its direction of motion;
+    # a link of unknown shape is not asked to
+    ways = (False,) if striker_face(robot, arm.name) is None else (False, True)
+    for edgewise, hit in product(ways, targets):
         strong, message = strongest(robot, arm, q, hit, with_face=not edgewise)
         if strong:
             break

@@ -69,6 +69,11 @@ class NotSolvedWarning(UserWarning):
     """The result is not a solution: its numbers are those of the best iterate."""
 
 
+def counted(count: int, one: str, several: str = "") -> str:
+    """Number with its noun: "1 joint", "2 joints"; several : plural of ``one``, if not by an s."""
+    return f"{count} {one if count == 1 else several or f'{one}s'}"
+
+
 def did_you_mean(name: str, options: Iterable[str]) -> str:
     """Suggestion for a misspelt name, for the end of a message: " (did you mean 'x'?)", or ""."""
     candidates = {str(option).casefold(): str(option) for option in options}

@@ -22,6 +22,9 @@ from impactopt.robots.tools import without
 Array = NDArray[np.float64]
 ROD = 0.012  # [m] radius of a tool
 _SHORTEST_SIDE = 0.02  # [m] of a box of inertia
+# [kg/m3] Least mean density of a link, half of a light foam's. The inertia of many files, such as 0.001 kg m2
+# for 10 g, stands for none: its box, of 0.8 m, would be in the way of any motion.
+LEAST_DENSITY = 10.0
 # a shape is too large above both this size [m] and this multiple of the box of its inertia
 _LARGE, _LARGE_RATIO = 1.0, 8.0
 # length of collision shapes, over that of the visual ones, below which they only stand for a link
@@ -177,15 +180,24 @@ def _from_inertia(robot: Robot) -> Iterator[Piece]:
 
 
 def inertia_box(inertia: Any) -> Solid:
-    """Rounded box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis."""
+    """Rounded box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis.
+
+    If it were lighter than `LEAST_DENSITY`, it is scaled down to that.
+    """
+    sides, axes = inertia_sides(inertia)
+    least = np.cbrt(min(inertia.mass / (np.prod(sides) * LEAST_DENSITY), 1.0))
+    return rounded_box(np.maximum(least * sides, _SHORTEST_SIDE)).moved(axes, np.array(inertia.lever))
+
+
+def inertia_sides(inertia: Any) -> tuple[Array, Array]:
+    """Sides (3,) [m] and axes (3, 3) of the box that has a mass and an inertia."""
     moments, axes = np.linalg.eigh(np.array(inertia.inertia))
     # With sides a, b, c the moments are m (b^2 + c^2) / 12 and so on: their sum less
     # twice the first gives a^2.
     squares = 6.0 / inertia.mass * (moments.sum() - 2 * moments)
     # eigh's axes may be left-handed, and a reflection would turn the solid inside out.
     axes = axes if np.linalg.det(axes) > 0 else -axes
-    sides = np.sqrt(np.maximum(squares, _SHORTEST_SIDE**2))
-    return rounded_box(sides).moved(axes, np.array(inertia.lever))
+    return np.sqrt(np.maximum(squares, _SHORTEST_SIDE**2)), axes
 
 
 def _of_tool(robot: Robot, tool: Tool) -> Iterator[Piece]:

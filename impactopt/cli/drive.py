@@ -29,6 +29,7 @@ def drive(
     is in, 1 it is not, 2 bad input.
     """
     with plain_errors("interrupted before the nail was in", verbose=verbose, as_json=as_json) as console:
+        from impactopt.errors import counted
         from impactopt.files.output import check_directory, keep_series, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.record import plain
@@ -48,7 +49,7 @@ def drive(
             print_json(done, series.done)
         else:
             output().print(nail_driving_table(done))
-            typer.echo(series.reason or f"the nail is in after {len(series.blows)} blows")
+            typer.echo(series.reason or f"the nail is in after {counted(len(series.blows), 'blow')}")
             if aside := set_aside(done):
                 typer.echo(aside)
         if not series.done:

@@ -47,7 +47,7 @@ def strike(
     with plain_errors(
         "interrupted before there was a strike to keep", verbose=verbose, as_json=as_json
     ) as console:
-        from impactopt.errors import printable
+        from impactopt.errors import counted, printable
         from impactopt.files.output import check_directory, keep_record, record_of_strike, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.planning.strike import optimize_strike
@@ -69,7 +69,7 @@ def strike(
                 callback=progress.iteration if workers == 1 else None,
                 **chosen,
             )
-            progress.say(f"best of {len(solution.attempts)} starts: {solution.status.message}")
+            progress.say(f"best of {counted(len(solution.attempts), 'start')}: {solution.status.message}")
             if solution.caution:
                 progress.say(solution.caution)
         record = record_of_strike(solution, problem=read.text, problem_path=read.path)

@@ -18,6 +18,7 @@ from impactopt.collision.outputs import HISTORIES, OF_SOLES, Outputs, frozen_for
 from impactopt.collision.runge_kutta import rk4_step, run
 from impactopt.collision.stepped import SteppedModel, number_of_steps
 from impactopt.contact import Target
+from impactopt.errors import counted
 from impactopt.robots.rigid_body import RigidBody
 
 # largest number of implicit steps, which choose their own length
@@ -302,8 +303,8 @@ def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, st
     out["derivatives"] = "in `gradient_function`, and in `graph`"
     if independent := independent_joints(collision):
         out["nothing yet"] = (
-            f"{len(independent)} joints share none with the striking point's limb, and could be locked "
-            f"without any change: {', '.join(independent)}"
+            f"{counted(len(independent), 'joint shares', 'joints share')} none with the striking point's "
+            f"limb, and could be locked without any change: {', '.join(independent)}"
         )
     return out
 

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
 from impactopt.errors import InputError
+from impactopt.robots.build import joint_indices
 from impactopt.robots.checks import LEG, check_arms, check_legs
 from impactopt.robots.joint_angles import JointAngles
 from impactopt.robots.rigid_body import RigidBody
@@ -548,10 +549,22 @@ class StanceCoordinates:
         return self.split(self.posture)[1]
 
     def split(self, q_pin: Array) -> tuple[Array, Array]:
-        """Coordinates y (ny,) and legs (nl,) of a Pinocchio configuration (nq,)."""
+        """Coordinates y (ny,) and legs (nl,) of a Pinocchio configuration (nq,).
+
+        Angles without limits are the equivalent ones nearest to those of the given posture. Else a robot
+        whose root faces backwards, with a yaw of pi, would turn round once in a motion across it.
+        """
         q = self.rb.from_pin(q_pin)
+        turns = 2 * np.pi * np.round((self.rb.from_pin(self.posture) - q) / (2 * np.pi))
+        q = q + np.where(self._unlimited, turns, 0.0)
         joints = q[self.base :]
         return np.concatenate([q[: self.base], joints[self.independent]]), joints[self.dependent]
+
+    @cached_property
+    def _unlimited(self) -> NDArray[np.bool_]:
+        """Mask of the base's roll and yaw and of continuous joints among all coordinates."""
+        base = np.isin(np.arange(self.base), (3, 5))
+        return np.append(base, [self.model.joints[j].nq == 2 for j in joint_indices(self.model)])
 
     def join(self, y: Array, legs: Array) -> Array:
         """Pinocchio configuration (nq,) of y (ny,) and legs (nl,), or (k, nq) of k of them."""

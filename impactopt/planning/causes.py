@@ -28,9 +28,11 @@ from impactopt.planning.bounds import (
     phase_changes,
 )
 from impactopt.planning.budget import Budget
+from impactopt.planning.clearance_constraints import Margins, deepest_penetration
 from impactopt.planning.lazy_constraints import with_lazy_constraints
 from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import program_for
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import LONGEST, SHORTEST, Phase
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.program import NonlinearProgram, SolverResult, max_violation
@@ -161,10 +163,10 @@ class _CauseSearch:
             one = cause if not attempt or cause.nearer is None else cause.nearer(attempt / _MAX_VALUES)
             if one.problem is None:
                 break
-            t = program_for(self.t, one.problem)
             # A confirmation does not take from the search.
             self._iterations += _ITERATIONS_CHANGED
-            if self._run(t.program, first_iterate(t), _ITERATIONS_CHANGED) is not None:
+            solution = self._solution(one.problem, _ITERATIONS_CHANGED)
+            if solution is not None and not _penetrates(*solution):
                 return replace(one, nearer=None)
         return replace(cause, nearer=None) if cause.problem is None else None
 
@@ -184,8 +186,10 @@ class _CauseSearch:
                 continue
             if self._budget.is_over():
                 return
-            t = program_for(self.t.with_clearance({}), new)
-            if self._run(t.program, first_iterate(t), _ITERATIONS_STIFFNESS) is not None:
+            solution = self._solution(new, _ITERATIONS_STIFFNESS)
+            if solution is not None:
+                if _penetrates(*solution):
+                    return  # so would the motions of other stiffnesses
                 yield Cause(
                     kind="a soft contact" if factor > 1 else "a stiff contact",
                     text=f"stiffness of the contact: {value:.2g} N/m instead of {known:.2g} N/m "
@@ -193,6 +197,12 @@ class _CauseSearch:
                     problem=changed(self.given, law=law),
                 )
                 return
+
+    def _solution(self, problem: ImpactProblem, most: int) -> tuple[Transcription, Array] | None:
+        """Program and solution (n,) of a problem from its initial guess; None if there is none."""
+        t = program_for(self.t, problem)
+        result = self._run(t.program, first_iterate(t), most)
+        return None if result is None else (t, result.x)
 
     def _run(self, program: NonlinearProgram, start: Array, most: int, **more: Any) -> SolverResult | None:
         """Result of the solver in ``most`` iterations, out of those left; None if it is not a solution."""
@@ -233,6 +243,14 @@ class _CauseSearch:
         if result is None:
             return None
         return result.x[: program.n], relaxed.sizes(result.x)
+
+
+def _penetrates(t: Transcription, x: Array) -> bool:
+    """True if bodies penetrate at the nodes of a solution (n,).
+
+    Its program has clearance constraints only for those that were near in the failed solve.
+    """
+    return t.problem.keeps_apart and bool(deepest_penetration(t, x, Margins(t.problem))[1])
 
 
 def _loosened(phase: Phase) -> Phase:

@@ -98,11 +98,11 @@ class Margins:
         # Constraints are on rounded distances, which are less than the exact ones by up to ROUNDING. Required
         # clearances are reduced by the same amount, or a posture that is allowed would violate them.
         at_start = START_FRACTION * exact - np.minimum(exact - near.gap, EDGE_ROUNDING)
-        # At most half of the rounded gap, so that the start is inside its own constraint; a pair in
-        # penetration may stay as deep, and a little deeper.
-        at_start = np.where(
-            near.gap > 0, np.clip(at_start, 0.0, near.gap / 2), near.gap - START_PENETRATION_SLACK
-        )
+        # At most half of the rounded gap, so that the start is inside its own constraint. A pair in
+        # penetration may stay as deep, and a little deeper. One whose rounded shapes alone penetrate may lose
+        # a part of its distance: the error of rounding differs between postures.
+        deeper = np.where(exact > 0, START_FRACTION * exact, START_PENETRATION_SLACK)
+        at_start = np.where(near.gap > 0, np.clip(at_start, 0.0, near.gap / 2), near.gap - deeper)
         self.pieces[near.pair] = np.minimum(self.pieces[near.pair], at_start)
 
     @property

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
+from impactopt.errors import counted
 from impactopt.planning.bounds import Cause
 from impactopt.planning.contact_replay import SOLVED_WITHIN, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gain_selection import ChosenGains
@@ -68,7 +69,7 @@ class Solved:
         impulse = getattr(self, "impulse", np.nan)
         return (
             f"<{type(self).__name__} of {self.problem.name or self.problem.robot.name!r}: "
-            f"{self.status.value}, {impulse:.2f} N s, {self.result.iterations} iterations>"
+            f"{self.status.value}, {impulse:.2f} N s, {counted(self.result.iterations, 'iteration')}>"
         )
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +11,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from impactopt.kinematics.inverse_kinematics import Reach, reach
+from impactopt.bodies.clearance import Places, Touch
+from impactopt.errors import InputError
+from impactopt.kinematics.inverse_kinematics import Reach, inverse_kinematics, reach
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.plausibility import giant_soles
@@ -29,13 +33,19 @@ PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers in a problem f
 LONG = 10.0  # [s] of a phase: longer ones are hard to believe
 HEAVY = 20.0  # mass of a target over the robot's, likewise
 DRAWN_POSTURES = 3  # initial guesses of inverse kinematics, beside the postures at start and at contact
+# random postures at the hit point: number, and standard deviation [rad] of their initial guesses
+DRAWN_AT_HIT, AT_HIT_SPREAD = 15, 1.0
+BLOCKED_DEPTH = 0.01  # [m] of penetration in all postures at the hit point, above which it counts as blocked
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """Reasons why no solve can succeed: implausibly large soles; else a start beyond the target, and a hit
-    point that no balanced posture reaches.
+    """Reasons why no solve can succeed: implausibly large soles; else a start beyond the target, a hit point
+    that no balanced posture reaches, and one where bodies penetrate in all postures that reach it.
     """
-    found = list(giant_soles(problem.robot)) or [_beyond(problem), _out_of_balance(problem)]
+    found = list(giant_soles(problem.robot)) or [
+        _beyond(problem),
+        _out_of_balance(problem) or _blocked(problem),
+    ]
     return [text for text in found if text]
 
 
@@ -150,3 +160,37 @@ def _nearest(problem: ImpactProblem, polygon: Array) -> Reach:
             break
     assert best is not None
     return best
+
+
+def _blocked(problem: ImpactProblem) -> str:
+    """Message about a hit point where two bodies penetrate deeply in all postures that are found; else ""."""
+    if problem.second is not None or not (problem.keep_out.enabled and problem.self_collision.enabled):
+        return ""
+    try:
+        bodies = problem.bodies
+    except InputError:  # of the start posture, which a solve refuses
+        return ""
+    found = list[Touch]()
+    for q in _postures_at_hit(problem):
+        at = Places.of(problem.robot, q[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+        touches = bodies.survey(np.zeros(1), at).touches
+        if not touches or touches[0].depth < BLOCKED_DEPTH:
+            return ""
+        found.append(touches[0])
+    best = min(found, key=lambda touch: touch.depth)
+    return (
+        f"in each of {len(found)} postures found at the hit point two bodies penetrate each other, in the "
+        f"best one {best.one!r} and {best.other!r} by {1e3 * best.depth:.0f} mm; correct their shapes, or "
+        "move the point"
+    )
+
+
+def _postures_at_hit(problem: ImpactProblem) -> Iterator[Array]:
+    """Configurations (nq,) with the striking point at the hit point: that of the problem, and random ones."""
+    robot, rng = problem.robot, np.random.default_rng(0)
+    yield problem.contact_posture
+    for _ in range(DRAWN_AT_HIT):
+        step = np.concatenate([np.zeros(robot.nv - robot.n), AT_HIT_SPREAD * rng.standard_normal(robot.n)])
+        guess = pin.integrate(robot.model, problem.contact_posture, step)
+        with contextlib.suppress(InputError):
+            yield inverse_kinematics(problem.coordinates, problem.striker, problem.point, guess, starts=1)

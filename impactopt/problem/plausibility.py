@@ -7,20 +7,28 @@ from collections.abc import Iterator
 import numpy as np
 import pinocchio as pin
 
-from impactopt.bodies.convex_hulls import distance_to_link, is_far, size_of
+from impactopt.bodies.convex_hulls import LEAST_DENSITY, distance_to_link, inertia_sides, is_far, size_of
 from impactopt.bodies.file_shapes import lost_meshes
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.solids import NOT_FOUND
+from impactopt.errors import counted
 from impactopt.robots.gains import HEAVIEST_ROTOR, LIGHTEST_ROTOR
 from impactopt.robots.robot import Robot
 
 GIANT = 3.0  # length of a sole over that of its leg: no sole is so long
+LIGHTEST = 1e-3  # [kg] of a link whose inertia is doubted
 ALIKE = 0.2  # relative difference of left and right soles in length or width that is no doubt
 
 
 def doubts(robot: Robot) -> list[str]:
     """Messages about parameters of a robot that are missing, or hard to believe, and that plans depend on."""
-    return [*_without_armature(robot), *_armatures(robot), *_sides(robot), *shape_doubts(robot)]
+    return [
+        *_without_armature(robot),
+        *_armatures(robot),
+        *light_links(robot),
+        *_sides(robot),
+        *shape_doubts(robot),
+    ]
 
 
 def giant_soles(robot: Robot) -> Iterator[str]:
@@ -70,6 +78,22 @@ def _armatures(robot: Robot) -> Iterator[str]:
                 f"{torque:.3g} N m, too {what}; {bound * torque:.2g} kg m2 is the {end} (rotor inertia "
                 "x gear ratio^2)"
             )
+
+
+def light_links(robot: Robot) -> Iterator[str]:
+    """Message about links whose inertia is that of a body lighter than any robot's."""
+    model, sizes = robot.model, dict[str, tuple[float, float]]()
+    for name, body in zip(list(model.names)[1:], list(model.inertias)[1:], strict=True):
+        sides = inertia_sides(body)[0] if body.mass > LIGHTEST else np.zeros(3)
+        if body.mass < LEAST_DENSITY * np.prod(sides):
+            sizes[str(name)] = float(sides.max()), float(body.mass)
+    if sizes:
+        names = sorted(sizes, key=lambda name: -sizes[name][0])
+        size, mass = sizes[names[0]]
+        yield (
+            f"inertia of {_counted(names)}: that of {mass:.2g} kg in a box {size:.2g} m long is hard to "
+            "believe; give the link's own, in kg m2"
+        )
 
 
 def _sides(robot: Robot) -> Iterator[str]:
@@ -133,13 +157,13 @@ def _lost_meshes(robot: Robot) -> Iterator[str]:
             "; put them into a folder above the URDF, or name the folder of their package in ROS_PACKAGE_PATH"
         )
         yield (
-            f"{len(reasons)} meshes are lost, and boxes of inertia stand for links without any: "
-            f"{each}{where * (NOT_FOUND in by_reason)}"
+            f"{counted(len(reasons), 'mesh is', 'meshes are')} lost, and boxes of inertia stand for links "
+            f"without any: {each}{where * (NOT_FOUND in by_reason)}"
         )
 
 
 def _counted(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more joints"
+    return names[0] if len(names) == 1 else f"{names[0]} and {counted(len(names) - 1, 'more joint')}"
 
 
 def _times(size: np.ndarray) -> str:

@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.status import Status
 from rich.table import Table
 
-from impactopt.errors import printable
+from impactopt.errors import counted, printable
 from impactopt.report.result_rows import (
     PHASES,
     Row,
@@ -111,7 +111,7 @@ def say_details(console: Console, summary: Mapping[str, Any]) -> None:
         console.print(violation_table(summary["violations"]))
     say(
         console,
-        f"{summary['solver']}: {summary['status']} after {summary['iterations']} iterations, "
+        f"{summary['solver']}: {summary['status']} after {counted(summary['iterations'], 'iteration')}, "
         f"{summary['solve_seconds']:.1f} s; building took {summary['build_seconds']:.1f} s",
     )
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from html import escape
 from typing import Any
 
+from impactopt.errors import counted
 from impactopt.files.output import record_of
 from impactopt.files.record import Record
 from impactopt.planning.solution import Solution
@@ -95,7 +96,7 @@ def _cards(s: Mapping[str, Any]) -> str:
         )
 
     seconds = f"{s.get('solve_seconds') or 0.0:.1f}{NARROW}s"
-    spent = f"{s.get('solver', '')}, {s.get('iterations', 0)} iterations, {seconds}"
+    spent = f"{s.get('solver', '')}, {counted(s.get('iterations', 0), 'iteration')}, {seconds}"
     card(str(s.get("status", "?")), spent, "good" if s.get("status") == "solved" else "bad")
     if s.get("impulse_Ns") is not None:
         error = replay.get("impulse_error_pct")

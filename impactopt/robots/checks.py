@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, did_you_mean
+from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, counted, did_you_mean
 from impactopt.robots.mass_matrix import mass_matrix
 
 _MARK = "\x00"  # no name in a file contains it
@@ -277,8 +277,9 @@ def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]
         shared = ", ".join(robot.joint_names[j] for j in arm if j in others)
         if len(arm) < LEG:
             found.found.append(
-                f"hand {name!r} cannot be fixed in all six directions: between the base and it there are "
-                f"{len(arm)} joints{': ' if listed else ''}{listed}; give a hand with {LEG} or more"
+                f"hand {name!r} cannot be fixed in all six directions: it has "
+                f"{counted(len(arm), 'joint')} from the base on{': ' if listed else ''}{listed}; "
+                f"give a hand with {LEG} or more"
             )
         elif shared:
             found.found.append(

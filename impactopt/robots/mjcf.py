@@ -9,7 +9,7 @@ read actuators.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
@@ -25,6 +25,7 @@ from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, missing_package
 from impactopt.robots.build import ROOT, existing, friction, set_friction
 from impactopt.robots.description import Description, Tie, between
+from impactopt.robots.gravity_compensation import CompensatedBody, Compensation, compensation
 from impactopt.robots.joint_angles import JointAngles
 from impactopt.robots.tendons import Tendon
 
@@ -69,30 +70,42 @@ class Compiled:
         return np.asarray(getattr(self.mj, name, np.zeros(0)))
 
 
-def ties_of(c: Compiled) -> Iterator[Tie]:
-    """Ties of the robot's joints: nonlinear forces, equalities, tendons, and partial gravity compensation."""
+def ties_of(c: Compiled, torque: Mapping[str, float]) -> Iterator[Tie]:
+    """Ties of the robot's joints: nonlinear forces, equalities, tendons, and partial gravity compensation.
+
+    torque [N m] : limits by joint, over which the compensation of light bodies is neglected.
+    """
     yield from _nonlinear_joints(c)
     if not c.off("equality", "constraint"):
         yield from _equalities(c)
     yield from _tendons(c)
-    yield from _partly_weightless(c)
+    yield from _partly_weightless(c, torque)
 
 
 def gravity_of(c: Compiled) -> Array:
-    """Gravity (3,) [m/s2], reduced by `gravcomp` if all bodies have the same."""
+    """Gravity (3,) [m/s2], reduced by the bodies' `gravcomp`."""
     if c.off("gravity"):
         return np.zeros(3)
-    shares = _gravcomp(c)
-    share = shares.pop() if len(shares) == 1 else 0.0
-    return np.array(c.mj.opt.gravity) * (1.0 - share)
+    found = _gravcomp(c)
+    return np.array(c.mj.opt.gravity) * (1.0 - (0.0 if found is None else found.fraction))
 
 
-def notes_of(c: Compiled) -> Iterator[str]:
-    """Notes on features that are left out, or are treated differently than by MuJoCo."""
+def notes_of(c: Compiled, torque: Mapping[str, float]) -> Iterator[str]:
+    """Notes on features that are left out, or are treated differently than by MuJoCo; torque [N m] : limits
+    by joint.
+    """
     mj = c.mj
-    shares = _gravcomp(c)
-    if len(shares) == 1 and (share := shares.pop()) and not c.off("gravity"):
-        yield f"all bodies have gravcomp {share:g}: motors carry {1 - share:g} times the weight, as in MuJoCo"
+    found = _gravcomp(c)
+    if found is not None and found.fraction:
+        carried = f"motors carry {1 - found.fraction:g} times the weight, as in MuJoCo"
+        yield f"{'most' if found.others else 'all'} bodies have gravcomp {found.fraction:g}: {carried}"
+    shares = {} if found is None else found.negligible(torque)
+    if found is not None and shares:
+        joint = max(shares, key=lambda joint: shares[joint])
+        yield (
+            f"the gravcomp of {', '.join(map(repr, found.others))} is not that of the rest, and is left out: "
+            f"at most {found.loads[joint]:.2g} N m of {joint!r}, {100 * shares[joint]:.2g} % of its limit"
+        )
     if mj.opt.density > 0 or mj.opt.viscosity > 0:
         yield "fluid drag is left out: <option density, viscosity>"
     for j in range(mj.njnt):
@@ -113,28 +126,38 @@ def notes_of(c: Compiled) -> Iterator[str]:
         yield f"plugins of {', '.join(plugged)} are left out"
 
 
-def _gravcomp(c: Compiled) -> set[float]:
-    """Compensated fractions of gravity (`gravcomp`) of the moving bodies; {0} if motors apply them."""
-    mj = c.mj
+def _gravcomp(c: Compiled) -> Compensation | None:
+    """Gravity compensation of the moving bodies; None without gravity, and if motors apply it."""
+    mj, gravity = c.mj, np.array(c.mj.opt.gravity)
     by_motors = c.numbers("jnt_actgravcomp")[sorted(c.joint)]
-    if by_motors.size and by_motors.all() and not c.floating:
-        return {0.0}  # it is part of the motors' torque, inside its limits: this is ordinary gravity
-    return {float(mj.body_gravcomp[b]) for b in c.moving()}
+    # that of motors is part of their torque, inside its limits: this is ordinary gravity
+    if c.off("gravity") or not gravity.any() or (by_motors.size and by_motors.all() and not c.floating):
+        return None
+    bodies = [
+        CompensatedBody(
+            name=c.name("body", b),
+            joint=c.body[b][0],
+            mass=float(mj.body_mass[b]),
+            centre=c.body[b][1].act(np.array(mj.body_ipos[b])),
+            fraction=float(mj.body_gravcomp[b]),
+        )
+        for b in c.moving()
+    ]
+    return compensation(c.model, gravity, bodies)
 
 
-def _partly_weightless(c: Compiled) -> Iterator[Tie]:
+def _partly_weightless(c: Compiled, torque: Mapping[str, float]) -> Iterator[Tie]:
     """Different `gravcomp` of bodies, for which the equations of motion have no gravity vector."""
-    if len(_gravcomp(c)) < 2 or c.off("gravity"):
-        return
-    bodies = [b for b in c.moving() if c.mj.body_gravcomp[b]]
-    above = sorted({j for b in bodies for j in map(int, c.model.supports[c.body[b][0]]) if j})
-    names = ", ".join(repr(c.name("body", b)) for b in bodies)
-    yield Tie(
-        text=f"bodies {names} have another gravcomp than the rest",
-        joints=tuple(str(c.model.names[j]) for j in above),
-        free=0,
-        fix="give all of them the same",
-    )
+    found = _gravcomp(c)
+    light = {} if found is None else found.negligible({} if c.floating else torque)
+    heavy = () if found is None else tuple(joint for joint in found.loads if joint not in light)
+    if found is not None and heavy:
+        yield Tie(
+            text=f"the gravcomp of {', '.join(map(repr, found.others))} is not that of the rest",
+            joints=heavy,
+            free=0,
+            fix="give all of them the same",
+        )
 
 
 def _nonlinear_joints(c: Compiled) -> Iterator[Tie]:
@@ -395,9 +418,9 @@ class _Reader(Compiled):
             q[3:7] = pin.Quaternion(_rotation(self.mj.body_quat[self.roots[0]])).coeffs()
             self.model.referenceConfigurations[ROOT] = q
         self.model.gravity = pin.Motion(gravity_of(self), np.zeros(3))
-        self.out.ties += ties_of(self)
+        self.out.ties += ties_of(self, self.out.torque)
         self.out.tendons += tendons_of(self)
-        self.out.notes += notes_of(self)
+        self.out.notes += notes_of(self, self.out.torque)
         self.out.lead_from_root()
         return self.out
 

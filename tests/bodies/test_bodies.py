@@ -144,6 +144,13 @@ def test_the_box_of_inertia_is_the_box_that_has_it(sides: tuple[float, float, fl
     np.testing.assert_allclose(local.min(axis=0), -np.array(sides) / 2, rtol=1e-6)
 
 
+def test_the_box_of_an_inertia_that_stands_for_none_is_no_lighter_than_foam() -> None:
+    """10 g with 0.001 kg m2, as many files have, would fill 0.8 m, and be in the way of any motion."""
+    box = inertia_box(pin.Inertia(0.01, np.array([0.1, 0.0, 0.0]), 1e-3 * np.eye(3))).vertices
+    np.testing.assert_allclose(np.ptp(box, axis=0), 0.1, rtol=1e-6)
+    np.testing.assert_allclose((box.max(axis=0) + box.min(axis=0)) / 2, [0.1, 0.0, 0.0], atol=1e-9)
+
+
 def test_a_disc_of_many_corners_is_a_body(tmp_path: Path) -> None:
     """The fan of triangles on its face has one corner in all of them, more than coal counts."""
     turn = np.linspace(0.0, 2 * np.pi, 900, endpoint=False)

@@ -757,6 +757,18 @@ def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: floa
     assert ("rise" in read_toml(draft.text)["robot"].get("locked_rad", {})) == locked
 
 
+def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
+    """Fetch's arm was to strike 2.4 m beside it, where no swing of a second takes its base."""
+    text = urdfs.arm().replace('<parent link="base"/>', '<parent link="mobile"/>', 1)
+    links = [urdfs.link(name, 4.0, (0.1, 0.1, 0.1), (0, 0, 0)) for name in ("turning", "mobile")]
+    far = (-999999.0, 999999.0)
+    steer = urdfs.joint("steer", "base", "turning", "0 0 1", (0, 0, 0.2), far)
+    roll = urdfs.joint("roll", "turning", "mobile", "1 0 0", (0, 0, 0), far, kind="prismatic")
+    (tmp_path / "robot.urdf").write_text(text.replace("</robot>", f"{''.join(links)}{steer}{roll}</robot>"))
+    locked = draft_robot(tmp_path / "robot.urdf").locked
+    assert {joint for joint, why in locked.items() if why == "drives a base"} == {"steer", "roll"}
+
+
 def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"
@@ -777,6 +789,24 @@ def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
     assert striker["point_m"] == pytest.approx([0.0, 0.0, 0.48], abs=1e-3)
     (tmp_path / "arm.toml").write_text(draft.text)
     assert load_problem(tmp_path / "arm.toml").robot.torque_limit[1] == 30.0
+
+
+def test_an_mjcf_with_weightless_fingers_is_bolted(tmp_path: Path) -> None:
+    """It was read as one that floats, which refused the gravcomp of its fingers before they were locked."""
+    pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    path.write_text("""
+        <mujoco><default><geom type="capsule" size=".03" fromto="0 0 0 0 0 .3"/></default><worldbody>
+        <body name="base"><geom/><body name="upper" pos="0 0 .3">
+        <joint name="shoulder" axis="0 1 0" range="-100 100"/><geom/>
+        <body name="lower" pos="0 0 .3"><joint name="elbow" axis="0 1 0" range="-140 140"/><geom/>
+        <body name="finger" pos="0 0 .3" gravcomp="1"><geom size=".01" fromto="0 0 0 0 0 .05"/>
+        <joint name="claw" type="slide" axis="0 1 0" range="0 .05"/></body></body></body></body></worldbody>
+        <actuator><motor joint="shoulder" ctrlrange="-90 90"/><motor joint="elbow" ctrlrange="-30 30"/>
+        </actuator></mujoco>
+    """)
+    drafted = draft_robot(path, mjcf=True)
+    assert not drafted.robot.floating and set(drafted.locked) == {"claw"}
 
 
 def test_a_joint_may_have_a_links_name(tmp_path: Path) -> None:

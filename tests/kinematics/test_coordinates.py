@@ -154,6 +154,18 @@ def test_split_and_join_are_inverse(case: Case) -> None:
         np.testing.assert_allclose(c.join(back_y, back_legs), q, atol=1e-12)
 
 
+def test_a_base_that_faces_backwards_does_not_turn_round() -> None:
+    """A yaw of pi at the start is one of -pi just beyond it: the first guess of iCub turned once."""
+    robot = biped()
+    for turn in (np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])):
+        q = robot.posture("half_sitting")
+        near = [pin.Quaternion(pin.exp3((np.pi + step) * turn)).coeffs() for step in (-0.01, 0.02)]
+        backwards, beyond = (np.concatenate([q[:3], base, q[7:]]) for base in near)
+        c = StanceCoordinates(robot, (), backwards)
+        step = c.split(beyond)[0] - c.start
+        np.testing.assert_allclose(step[3:6], 0.03 * turn, atol=1e-9)
+
+
 # ---- fixed soles
 
 

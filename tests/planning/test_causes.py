@@ -18,6 +18,7 @@ from impactopt import (
     Impulse,
     Nail,
     NotSolvedWarning,
+    Obstacle,
     Phase,
     Solution,
     Status,
@@ -66,6 +67,14 @@ def test_the_bound_that_is_named_is_the_one_that_has_to_move(arm: ImpactProblem,
     )
     assert cause.problem is not None
     assert solve(cause.problem).status.usable
+
+
+def test_no_cause_is_confirmed_by_a_motion_through_an_obstacle(arm: ImpactProblem) -> None:
+    """Here another stiffness was named, which is solved without the obstacle."""
+    low = [dataclasses.replace(phase, intervals=6) for phase in (arm.swing, arm.follow)]
+    shelf = Obstacle(name="shelf", size=(0.3, 0.3, 0.1), position=(0.7, 0.0, 0.8))
+    blocked = dataclasses.replace(arm, swing=low[0], follow=low[1], obstacles=(shelf,))
+    assert not searched(blocked)[2].causes
 
 
 def test_no_less_would_do(arm: ImpactProblem) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
 from impactopt import ImpactProblem, Obstacle, Solution, Status, load_problem, solve
+from impactopt.bodies.clearance import Places
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget
@@ -55,6 +56,27 @@ def hammer(solution: Solution, time: float) -> Array:
 
 def violation(t: Transcription, x: Array) -> float:
     return max_violation(t.program, x, t.program.constraints(x))
+
+
+def test_bodies_that_are_near_at_the_start_may_not_penetrate_more_than_their_rounded_shapes() -> None:
+    """Rounded shapes of bodies 1 mm apart penetrate; these were allowed to, by 2 mm, and so were refused."""
+    problem = load_problem("arm_planar")
+
+    def beside(place: float) -> tuple[Margins, float]:
+        wall = Obstacle(name="wall", size=(2.0, 0.1, 2.0), position=(0.5, place, 0.8))
+        margins = Margins(dataclasses.replace(problem, obstacles=(wall,)))
+        bodies = margins.bodies
+        (number,) = [-1 - k for k, body in enumerate(bodies.world) if body.name == "wall"]
+        at = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+        return margins, min(bodies.exact(at, 0, (joint, number)) for joint in bodies.links.joints)
+
+    margins, distance = beside(1.0 - beside(1.0)[1] + 1e-3)
+    assert distance == pytest.approx(1e-3, abs=1e-6)
+    shapes, none = margins.bodies.shapes, np.zeros((1, len(margins.bodies.shapes), 3))
+    at = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    found = shapes.look(margins.bodies.placed(at), 0.1, none, margins.wanted)
+    gap, required = found.gap.min(), margins.pieces[found.pair[found.gap.argmin()]]
+    assert gap < 0 and gap - distance < required < gap
 
 
 @pytest.mark.parametrize("share", [0.35, 0.5, 0.65])

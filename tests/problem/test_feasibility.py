@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,18 @@ from support.small_plans import biped_problem
 from support.small_robots import arm, biped
 from typer.testing import CliRunner
 
-from impactopt import FixedBase, FreeMass, ImpactProblem, InputError, Phase, SpringDamper, load_problem
+from impactopt import (
+    FixedBase,
+    FreeMass,
+    ImpactProblem,
+    InputError,
+    NotSolvedWarning,
+    Obstacle,
+    Phase,
+    SpringDamper,
+    load_problem,
+    solve,
+)
 from impactopt.cli.app import app
 from impactopt.files.draft.drafting import draft_problem
 from impactopt.kinematics.support import margin, support_polygon
@@ -68,6 +80,19 @@ def test_a_start_beyond_the_target_is_told_with_its_distance() -> None:
     (said,) = hopeless(ahead)
     assert "beyond the target" in said and "80 mm past" in said
     assert hopeless(_punch(np.add(start, [0.08, 0.0, 0.0]).tolist())) == []
+
+
+def test_a_hit_point_inside_an_obstacle_is_told_before_a_stiffness() -> None:
+    """The search for a cause named another stiffness, whose motion went through the obstacle."""
+    problem = load_problem("arm_planar")
+    below, above = ([*problem.point[:2], problem.point[2] + dz] for dz in (-0.3, 0.05))
+    shelf = Obstacle(name="shelf", size=(0.3, 0.3, 0.1), position=tuple(below))
+    assert hopeless(dataclasses.replace(problem, obstacles=(shelf,))) == []
+    blocked = dataclasses.replace(problem, obstacles=(dataclasses.replace(shelf, position=tuple(above)),))
+    (said,) = hopeless(blocked)
+    assert "'shelf' by " in said
+    with pytest.warns(NotSolvedWarning, match="Infeasible: " + re.escape(said)):
+        solve(blocked, options={"max_iterations": 10})
 
 
 def test_a_fixed_base_is_not_asked_for_balance() -> None:

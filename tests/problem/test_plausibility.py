@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from support import urdfs
 from support.small_plans import biped_problem
@@ -41,6 +42,24 @@ def test_armatures_that_no_drive_has_are_doubted(value: float, word: str) -> Non
     robot = _with_armature(arm7(), value)
     (told,) = doubts(robot)
     assert word in told and f"{value:.2g} kg m2" in told and "rotor inertia x gear ratio^2" in told
+
+
+def test_the_inertia_of_a_body_lighter_than_foam_is_doubted() -> None:
+    robot = planar_arm()
+    model = robot.model.copy()
+    model.inertias[2] = pin.Inertia(0.01, np.zeros(3), 1e-3 * np.eye(3))
+    (told,) = doubts(dataclasses.replace(robot, model=model))
+    assert told.startswith(f"inertia of {model.names[2]}: that of 0.01 kg in a box 0.77 m long")
+    model.inertias[1] = model.inertias[2]
+    (told,) = doubts(dataclasses.replace(robot, model=model))
+    assert told.startswith(f"inertia of {model.names[1]} and 1 more joint: ")
+
+
+def test_one_lost_mesh_is_told_as_one(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdfs.arm().replace('<box size="0.08 0.08 0.1"/>', '<mesh filename="gone.stl"/>'))
+    told = doubts(Robot.from_urdf(path, floating=False, armature=0.1))
+    assert any(text.startswith("1 mesh is lost, and boxes of inertia stand for links") for text in told)
 
 
 def test_soles_in_millimetres_are_refused() -> None:

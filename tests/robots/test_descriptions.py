@@ -326,7 +326,7 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`gravcomp` of some": (
         [('<body name="two"', '<body gravcomp="1" name="two"')],
-        "'two' have another gravcomp.*lock",
+        "gravcomp of 'two' is not that of the rest.*lock",
     ),
     "`stiffness`, ": ([(J2, f'stiffness="9" springref=".5" {J2}')], ""),
     "`stiffness` that": ([(J2, f'stiffness="9 1" {J2}')], "'j2' has a spring whose torque is not linear"),

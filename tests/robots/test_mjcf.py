@@ -214,6 +214,45 @@ def test_own_numbers_win_over_the_files(tree: Path) -> None:
     assert robot.kp[robot.joint_index("shoulder")] == 800.0
 
 
+GRIPPER = """
+<mujoco><worldbody><body name="turntable" pos="0 0 1"><joint name="j1" axis="0 0 1" range="-3 3"/>
+  <inertial pos="0.1 0 0" mass="9" diaginertia=".1 .1 .1"/>
+  <body name="arm" gravcomp="{arm}"><joint name="j2" axis="0 1 0" range="-3 3"/>
+    <inertial pos="0.3 0 0" mass="4" diaginertia=".1 .1 .1"/>
+    <body name="finger" pos="0.6 0 0" gravcomp="{finger}">
+      <joint name="j3" type="slide" axis="0 1 0" range="0 .1"/>
+      <inertial pos="0.1 0 0" mass="{mass}" diaginertia="1e-4 1e-4 1e-4"/>
+</body></body></body></worldbody>
+<actuator><motor joint="j2" ctrlrange="-50 50"/></actuator></mujoco>
+"""
+
+
+def test_the_weight_above_a_turntable_needs_no_compensation(tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text(GRIPPER.format(arm=1, finger=1, mass=0.2))
+    robot = Robot.from_mjcf(tmp_path / "robot.xml", velocity_limit=3.0, torque_limit=50.0, floating=False)
+    assert not robot.model.gravity.linear.any()
+    assert any("all bodies have gravcomp 1" in note for note in robot.source.notes)
+
+
+def test_a_light_finger_may_be_compensated_if_it_is_locked(tmp_path: Path) -> None:
+    """MuJoCo's own passive force on the shoulder of the stretched arm is what the note bounds."""
+    path = tmp_path / "robot.xml"
+    given: dict[str, Any] = {"velocity_limit": 3.0, "torque_limit": 50.0, "floating": False}
+    path.write_text(GRIPPER.format(arm=0, finger=1, mass=0.2))
+    with pytest.raises(InputError, match=r"gravcomp of 'finger' is not that of the rest.*lock it"):
+        Robot.from_mjcf(path, **given)
+    robot = Robot.from_mjcf(path, locked=["j3"], **given)
+    mj = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(mj)
+    mujoco.mj_forward(mj, data)
+    load = float(abs(data.qfrc_gravcomp[1]))
+    told = f"at most {load:.2g} N m of 'j2', {100 * load / 50:.2g} % of its limit"
+    assert any(told in note for note in robot.source.notes)
+    path.write_text(GRIPPER.format(arm=0, finger=1, mass=1.0))
+    with pytest.raises(InputError, match="lock it"):
+        Robot.from_mjcf(path, locked=["j3"], **given)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [

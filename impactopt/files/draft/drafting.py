@@ -17,8 +17,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import seen_pieces
-from impactopt.bodies.robot_bodies import bodies_of
-from impactopt.errors import InputError
+from impactopt.bodies.robot_bodies import bodies_of, striker_face
+from impactopt.errors import InputError, counted
 from impactopt.files.draft.default_drives import DOUBT
 from impactopt.files.draft.hits import Hit, hits
 from impactopt.files.draft.limbs import Limb, renumbered
@@ -36,7 +36,7 @@ from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import StrikeSolution, optimize_strike
 from impactopt.problem.feasibility import hopeless
-from impactopt.problem.plausibility import shape_doubts
+from impactopt.problem.plausibility import light_links, shape_doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import DOWN, touches
 from impactopt.problem.terms import Slide
@@ -241,8 +241,10 @@ def _hardest(robot: Robot, arm: Arm, q: Array, targets: list[Hit]) -> tuple[list
     was none.
     """
     why = ""
-    # edgewise last: for an arm of few joints, which cannot turn the link's face to its direction of motion
-    for edgewise, hit in product((False, True), targets):
+    # edgewise last: for an arm of few joints, which cannot turn the link's face to its direction of motion;
+    # a link of unknown shape is not asked to
+    ways = (False,) if striker_face(robot, arm.name) is None else (False, True)
+    for edgewise, hit in product(ways, targets):
         strong, message = strongest(robot, arm, q, hit, with_face=not edgewise)
         if strong:
             break
@@ -572,7 +574,7 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         head.append(f"# {text}.")
     if drafted.wrong:
         head += [
-            f"# {len(drafted.wrong)} inertias are not physical. Correct the {robot_kind(drafted)}, or remove "
+            f"# {_wrong(drafted)}. Correct the {robot_kind(drafted)}, or remove "
             'the # before `inertias = "repaired"`:',
             *(f"#   {text.partition('; correct')[0]}" for text in drafted.wrong),
         ]
@@ -619,6 +621,7 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
                 f"sole {sole.name!r} has a leg of five joints: the foot may turn on it about {sole.hinge}, "
                 f"by {sole.hinge_range:g} rad, and it transmits no moment about that axis"
             )
+    yield from light_links(robot)
     yield from shape_doubts(robot)
     if drafted.locked:
         yield f"locked: {'; '.join(_reasons(drafted.locked))}"
@@ -631,20 +634,25 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
     ):
         if key in data["robot"]:
             count = len(data["robot"][key])
-            yield f"guessed, as the {robot_kind(drafted)} has none: {what} of {count} joints"
+            yield f"guessed, as the {robot_kind(drafted)} has none: {what} of {counted(count, 'joint')}"
     if guessed := int(_guessed_gains(robot).sum()):
         yield (
-            f"guessed: servo gains of {guessed} joints, kd = 1.5 s x torque limit, at most 150, and kp = "
-            "30/s x kd; give kp_N_m_rad and kd_N_m_s_rad"
+            f"guessed: servo gains of {counted(guessed, 'joint')}, kd = 1.5 s x torque limit, at most 150, "
+            "and kp = 30/s x kd; give kp_N_m_rad and kd_N_m_s_rad"
         )
     yield from drafted.drives.said[:3]
     if len(drafted.drives.said) > 3:
-        yield f"... and {len(drafted.drives.said) - 3} more such numbers: see the file's head"
+        yield f"... and {counted(len(drafted.drives.said) - 3, 'more such number')}: see the file's head"
     if drafted.wrong:
         yield (
-            f"{len(drafted.wrong)} inertias are not physical, listed at the file's head: correct them, or "
+            f"{_wrong(drafted)}, listed at the file's head: correct them, or "
             'set `inertias = "repaired"` there'
         )
+
+
+def _wrong(drafted: Drafted) -> str:
+    """Number of non-physical inertias in words."""
+    return f"{counted(len(drafted.wrong), 'inertia is', 'inertias are')} not physical"
 
 
 def _guessed_gains(robot: Robot) -> NDArray[np.bool_]:

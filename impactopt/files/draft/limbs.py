@@ -26,6 +26,7 @@ FINGER_MASS, FINGER_LENGTH = 0.03, 0.25
 # Fractions of the robot's height: largest height of a foot's lowest point above the lowest of all, and least
 # height of the root link's.
 FOOT_HEIGHT, ROOT_HEIGHT = 0.05, 0.1
+TRAVEL = 20.0  # [m] of a prismatic joint: a longer one drives a mobile base
 TOE = 0.03  # [m] from an ankle to a toe's joint, at least; half of it: largest height of foot over toe
 
 
@@ -60,7 +61,7 @@ def limbs_of(model: pin.Model) -> tuple[Limb, ...]:
 
 def to_lock(model: pin.Model) -> dict[str, str]:
     """Joints that a plan should not move, with reasons: fingers, wheels, joints without range or mass,
-    prismatic joints too weak for their load.
+    prismatic joints too weak for their load, drives of a mobile base.
     """
     children, out = _children(model), dict[str, str]()
     first = 2 if is_floating(model) else 1
@@ -87,6 +88,9 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             out[name] = "no mass"
         elif "JointModelP" in joint.shortname() and effort[joint.idx_v] < weight[joint.idx_v]:
             out[name] = f"{name} cannot lift what it carries"
+        elif "JointModelP" in joint.shortname() and high - low > TRAVEL:
+            # what turns such a slide steers the base
+            out |= {str(model.names[i]): "drives a base" for i in model.supports[j] if i >= first}
     for j in range(first, model.njoints):  # a hand: several short and light chains on one link
         small = [c for c in children[j] if mass[c] < FINGER_MASS * total and reach[c] < FINGER_LENGTH]
         if len(small) > 1 and len(small) == len(children[j]):

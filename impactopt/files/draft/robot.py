@@ -181,9 +181,11 @@ def _floating(path: Path, mjcf: bool, bolted: bool) -> Description:
     if is_floating(read.model):
         return read
     try:
-        return read_mjcf(path, floating=True)
+        floating = read_mjcf(path, floating=True)
     except InputError:  # several bodies on the ground
         return read
+    # on a fixed base only it may have `gravcomp` of some bodies
+    return floating if floating.ties == read.ties else read
 
 
 def _check_bolted(first: Description, found: Drafted) -> None:

@@ -89,7 +89,21 @@ def build_world(
     spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver, scene.solids.floor)
     _solids(mujoco_module(), spec, bodies, scene, near, in_contact)
     add_welds(spec, bodies, robot, scene.hands, solver.step)
-    return spec.compile()
+    world = spec.compile()
+    _tighten_balls(mujoco_module(), world)
+    return world
+
+
+def _tighten_balls(mujoco: Any, world: Any) -> None:
+    """Sets the enclosing balls of meshes, outside which MuJoCo computes no contact, to their vertices.
+
+    MuJoCo's own enclose the meshes' boxes: twice as many pairs of links come near enough for an exact test.
+    """
+    for geom in np.flatnonzero(world.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
+        mesh = world.geom_dataid[geom]
+        first, count = world.mesh_vertadr[mesh], world.mesh_vertnum[mesh]
+        vertices = world.mesh_vert[first : first + count].astype(np.float64)
+        world.geom_rbound[geom] = np.linalg.norm(vertices, axis=1).max() * (1 + 1e-9)
 
 
 def robot_on_floor(
@@ -339,7 +353,7 @@ class MujocoRobot:
     world, data : MuJoCo's model and its data
     dof, qpos_index : indices of the joints' rates in qvel and angles in qpos
     sites : of the h striking points
-    normal_jacobian (h, nv) : of their speeds along the normal, at the last call of `speeds_along`
+    normal_jacobian (h, nv) : of their speeds along the normal, at the last call of `update_contact`
     force_map (h, nv) : generalized forces of a unit of normal force at each, friction included;
         without friction the same array; that of bristles is set by `bend`
     deflections (h, 3), normal_forces (h,) : of the bristles [m], and the last forces [N] of `bend`
@@ -364,6 +378,7 @@ class MujocoRobot:
         self.qpos_index = np.array([joint.qposadr[0] for joint in joints])
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
         self._jacobian, self.normal_jacobian = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
+        self._site_type, self._velocity = self.mujoco.mjtObj.mjOBJ_SITE, np.zeros(6)
         self.sliding = None if friction is None else SlidingPoints(friction)
         self.deflections, self.normal_forces = np.zeros((len(strikers), 3)), np.zeros(len(strikers))
         self.mobility, self.tangential = mobility, np.zeros((2, 3))
@@ -404,9 +419,18 @@ class MujocoRobot:
         return np.asarray(self.data.site_xpos[self.sites])
 
     def speeds_along(self, normal: Array) -> Array:
-        """Speeds (h,) [m/s] of the striking points along a normal (3,).
+        """Speeds (h,) [m/s] of the striking points along a normal (3,)."""
+        velocity, speeds = self._velocity, []
+        for site in self.sites:
+            # angular, then linear, in world axes
+            self.mujoco.mj_objectVelocity(self.world, self.data, self._site_type, site, velocity, 0)
+            speeds.append(normal @ velocity[3:])
+        return np.array(speeds)
 
-        Updates `normal_jacobian` and `force_map`, that of bristles for the last normal forces.
+    def update_contact(self, normal: Array) -> None:
+        """Updates `normal_jacobian` and `force_map`, that of bristles for the last normal forces.
+
+        normal (3,) : of the contact.
         """
         J, jacobians = self._jacobian, []
         for k, site in enumerate(self.sites):
@@ -418,7 +442,12 @@ class MujocoRobot:
             self.sliding.surface = self.tangential[1]
             self.sliding.update(normal, jacobians, self.data.qvel)
             self.force_map = self.sliding.force_map(self.deflections, self.normal_forces)
-        return np.asarray(self.normal_jacobian @ self.data.qvel)
+
+    def release(self, step: float) -> None:
+        """Advances a target that moves across the normal by a step [s] without contact; releases bristles."""
+        if self.sliding is not None:
+            self.deflections, self.normal_forces = 0.0 * self.deflections, 0.0 * self.normal_forces
+            self.tangential = np.array([self.tangential[0] + step * self.tangential[1], self.tangential[1]])
 
     def bend(self, forces: Array, step: float) -> None:
         """Advances the bristles by a step [s] under normal forces (h,) [N], and sets `force_map`.
@@ -434,10 +463,10 @@ class MujocoRobot:
             velocity = self.tangential[1] + step * self.mobility * self.sliding.on_target(forces)
             self.tangential = np.array([self.tangential[0] + step * velocity, velocity])
 
-    def apply(self, torque: Array, forces: Array | float) -> None:
+    def apply(self, torque: Array, forces: Array | None) -> None:
         """Applies torques (n,) [N m] at the joints, and contact forces (h,) [N] against the normal."""
         applied = self.data.qfrc_applied
-        applied[:] = -np.atleast_1d(forces) @ self.force_map
+        applied[:] = 0.0 if forces is None else -forces @ self.force_map
         applied[self.dof] += torque
 
 

@@ -308,7 +308,7 @@ def follow_contact(
         first = world.rates(start + since, state, step=step)
         world.delay.keep(start + since, first.commanded)
         push = first.push
-        _add(touches, since, push)
+        touches.add(since, push)
         before, state = state, world.step(start + since, state, first, step)
         now = world.contact.side(state.target, 0.0 if push is None else float(push.total[-1]))
         events += [since + step] if now != side else []
@@ -322,12 +322,6 @@ def follow_contact(
         touches=tuple((start, end) for start, end, _ in touches.intervals),
         events=tuple(events),
     )
-
-
-def _add(touches: Touches, t: float, push: Push | None) -> None:
-    """Records the contact in a step that begins at a time [s]; None: there is none."""
-    none = np.zeros(1)
-    touches.add(t + none, none, none) if push is None else touches.add(t + push.times, push.total, push.given)
 
 
 def simulate_pinocchio(
@@ -376,7 +370,7 @@ def simulate_pinocchio(
         cuts.update(t, first.saturated, first.cut, step)
         push = first.push
         saturated += step * bool(np.any(np.abs(first.demand) > world.servo.limit))
-        _add(touches, t, push)
+        touches.add(t, push)
         gears.update(first.torque, first.a)
         if touches.touched or k % record == 0:
             motion = (state.q, state.v, float(first.forces.sum()), first.target_speed, first.hand_speed)

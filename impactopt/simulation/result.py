@@ -451,8 +451,18 @@ class Touches:
         self.touching = self.touched = False
         self._parts: list[tuple[Array, Array]] = []
 
-    def add(self, times: Array, force: Array, given: Array) -> None:
-        """Records a step: contact force (k,) [N], and impulse (k,) [N s] in the step, at times (k,) [s]."""
+    def add(self, t: float, push: Any) -> None:
+        """Records a step that begins at a time [s].
+
+        push : :class:`impactopt.simulation.target_dynamics.Push` of the step; None: no contact is near.
+        """
+        if push is None and not self.touching:  # most steps
+            self.touched = False
+            return
+        none = np.zeros(1)
+        times, force, given = (
+            (t + none, none, none) if push is None else (t + push.times, push.total, push.given)
+        )
         on = force > 0
         self.touched = self.touching or bool(on.any())
         if not self.touched:

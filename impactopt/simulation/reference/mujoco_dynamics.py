@@ -189,6 +189,7 @@ def march(
     while True:
         world.mujoco.mj_step1(world.world, data)  # up to velocities; forces are set before mj_step2
         speed = float(world.speeds_along(normal)[0])
+        world.update_contact(normal)
         if k == 0:
             start = float(normal @ world.striking_points()[0])
         if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):
@@ -216,8 +217,9 @@ def march(
         ends = (not phase.touching and (k > 0 or rate != 0)) or time >= horizon * (1 - 1e-9)
         if ends:
             end, tangential = world.state(), world.tangential[1]
-        world.bend(np.array([force]), step)
-        world.apply(torque - forces.friction(velocity, phase), force)
+        on_hand = np.array([force])
+        world.bend(on_hand, step)
+        world.apply(torque - forces.friction(velocity, phase), on_hand)
         world.mujoco.mj_step2(world.world, data)
         peak = max(peak, force)
         if ends or k % every == 0:

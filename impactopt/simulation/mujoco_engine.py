@@ -7,6 +7,8 @@ velocities, feed-forward), the robot's parameters and the scene.
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import replace
 from typing import Any
@@ -39,6 +41,7 @@ from impactopt.simulation.result import (
     Simulation,
     Touches,
     check_not_diverged,
+    cross,
     posture_error,
     simulation_of,
     stance_at,
@@ -46,7 +49,7 @@ from impactopt.simulation.result import (
 from impactopt.simulation.target_dynamics import Push, TargetContact
 
 Array = NDArray[np.float64]
-AXES, NEXT_AXES, PREVIOUS_AXES = np.arange(3), [1, 2, 0], [2, 0, 1]
+AXES = np.arange(3)
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where the body of a broken target goes
 # A robot has fallen beyond these errors of its base: tilt [rad], and loss of height, over the height of the
 # centre of mass at the start, as the base's own origin may lie on the ground
@@ -145,8 +148,8 @@ class _Replay(MujocoRobot):
             return self.servo.torque(t, d.qpos[self.qpos_index], d.qvel[self.dof])
         _, v = self.state()
         rotation = self.base_rotation() if self.floating else np.eye(3)
-        demand = self.wbc.torque(t, d.qpos[self.qpos_index], v, rotation, forces)
-        return demand, np.clip(demand, -self.servo.limit, self.servo.limit)
+        demand, limit = self.wbc.torque(t, d.qpos[self.qpos_index], v, rotation, forces), self.servo.limit
+        return demand, np.minimum(np.maximum(demand, -limit), limit)
 
     def start(self, q: Array) -> None:
         """Puts the robot at q (nq,), and welds supporting hands there."""
@@ -277,9 +280,7 @@ class _Replay(MujocoRobot):
         # the frame's first axis points from the first geom to the second: from the floor, geom 0, up
         parts = self.data.efc_force[contacts.efc_address[on][:, None] + AXES]
         force = (parts[:, None] @ axes)[:, 0]
-        # place x force; np.cross takes several times as long
-        moment = place[:, NEXT_AXES] * force[:, PREVIOUS_AXES] - place[:, PREVIOUS_AXES] * force[:, NEXT_AXES]
-        np.add.at(out, sole[on], np.concatenate([force, moment], axis=1))
+        np.add.at(out, sole[on], np.concatenate([force, cross(place, force)], axis=1))
         return out
 
     def ground(self) -> Array:
@@ -290,7 +291,7 @@ class _Replay(MujocoRobot):
         if not self.grips.frames:
             return self.sole_ground()
         wrenches, places = self.grips.wrenches(self.data)
-        wrenches[:, 3:] += np.cross(places, wrenches[:, :3])
+        wrenches[:, 3:] += cross(places, wrenches[:, :3])
         return np.vstack([self.sole_ground(), wrenches])
 
     def fallen(self, t: float) -> str:
@@ -302,11 +303,11 @@ class _Replay(MujocoRobot):
         if not self.scene.soles:
             return ""
         times = self.servo.time
-        now = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
+        now = max(bisect_right(times, t) - 1, 0)
         since = now
         if self.wbc is not None and self.wbc.tracking.recovers(t):
-            since = min(int(np.searchsorted(times, self.wbc.tracking.contact[1])), now)
-        lean = float(self.base_errors(slice(since, now + 1)).min())
+            since = min(bisect_left(times, self.wbc.tracking.contact[1]), now)
+        lean = self.base_error(slice(since, now + 1))
         height, planned = self.data.qpos[2], float(self.reference_q[since : now + 1, 2].min())
         if lean > FALLEN_TILT:
             return f"fell: the base leans {lean:.1f} rad from where it should be"
@@ -314,16 +315,17 @@ class _Replay(MujocoRobot):
             return f"fell: the base is {height:.2f} m high where it should be {planned:.2f} m"
         return ""
 
-    def base_errors(self, instants: slice) -> Array:
-        """Angles [rad] between the vertical axes of the base and of the reference at these instants."""
+    def base_error(self, instants: slice) -> float:
+        """Least angle [rad] between the vertical axes of the base and of the reference at these instants."""
         w, x, y, z = self.data.qpos[3:7].tolist()
-        return np.arccos(np.clip(self.upright[instants] @ _upright((x, y, z, w)), -1.0, 1.0))
+        cosine = float((self.upright[instants] @ _upright((x, y, z, w))).max())
+        return math.acos(min(max(cosine, -1.0), 1.0))
 
     def not_standing(self, simulation: Simulation) -> str:
         """Reason why the robot does not stand at the end of the simulation; "" if it does."""
         if not self.scene.soles:
             return ""
-        lean, speed = float(self.base_errors(slice(-1, None))[0]), float(np.linalg.norm(self.data.qvel[:3]))
+        lean, speed = self.base_error(slice(-1, None)), float(np.linalg.norm(self.data.qvel[:3]))
         if lean > STANDING_TILT:
             return f"leans at the end: base {lean:.2f} rad from where it should be"
         if speed > STANDING_SPEED:
@@ -431,7 +433,7 @@ def simulate_mujoco(
             motor_delay.keep(t, commanded)
             if reached is not previous:
                 demand, saturated_demand = reached
-                saturates = bool((np.abs(demand) > limit).any())
+                saturates = np.count_nonzero(np.abs(demand) > limit) > 0
             rates = data.qvel[replay.dof]
             cut = motors.cut(saturated_demand, rates)
             if motors.lines:

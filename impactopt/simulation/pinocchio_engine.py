@@ -23,6 +23,7 @@ from impactopt.simulation.result import (
     Simulation,
     Touches,
     check_not_diverged,
+    cross,
     posture_error,
     simulation_of,
     stance_at,
@@ -181,7 +182,7 @@ class _World:
     def ground(self) -> Array:
         """Wrenches (soles and hands, 6) of the world on them, about its origin, of the last `rates`."""
         wrenches = self.body.wrenches()
-        wrenches[:, 3:] += np.cross(self.body.origins(), wrenches[:, :3])
+        wrenches[:, 3:] += cross(self.body.origins(), wrenches[:, :3])
         out = np.zeros((len(self.scene.soles) + len(self.scene.hands), 6))
         out[self.fixed] = wrenches
         return out

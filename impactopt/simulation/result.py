@@ -374,6 +374,14 @@ class Simulation:
         return {name: given.get(name) for name in REPORT}
 
 
+_NEXT, _PREVIOUS = [1, 2, 0], [2, 0, 1]  # axes
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Products a x b (..., 3); np.cross takes several times as long."""
+    return a[..., _NEXT] * b[..., _PREVIOUS] - a[..., _PREVIOUS] * b[..., _NEXT]
+
+
 def centre_of_pressure(wrench: Array) -> Array:
     """Centre of pressure (..., 2) [m] on the ground of wrenches (..., 6) about the origin; nan at no load."""
     # moment about the origin over normal force: (-M_y, M_x) / F_z on the plane z = 0

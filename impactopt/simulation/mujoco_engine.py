@@ -433,7 +433,7 @@ def simulate_mujoco(
             motor_delay.keep(t, commanded)
             if reached is not previous:
                 demand, saturated_demand = reached
-                saturates = np.count_nonzero(np.abs(demand) > limit) > 0
+                saturates = bool(np.count_nonzero(np.abs(demand) > limit))
             rates = data.qvel[replay.dof]
             cut = motors.cut(saturated_demand, rates)
             if motors.lines:

@@ -73,7 +73,9 @@ class MujocoDynamics(ReferenceModel):
         self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float
     ) -> tuple[Collision, float]:
         body = DenseBody(*self._body_arguments, normal, self.contact_friction)
-        rate = body.update(q, v) - forces.target_speed(np.zeros(forces.target.n_states))
+        body.update(q, v)
+        body.update_contact()
+        rate = float(body.speeds()[0]) - forces.target_speed(np.zeros(forces.target.n_states))
         scales = contact_scales(body, forces, rate, self.horizon)
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
         fastest = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))

@@ -209,7 +209,7 @@ class _Replay(MujocoRobot):
             self.release(step)
             self.last_step = speeds, None
             return None
-        self.update_contact(self.scene.normal)
+        self.update_friction(self.scene.normal)
         self.response = np.zeros_like(self.normal_jacobian)
         # M is the free robot's: MuJoCo's contacts hold the soles, and their effect is in `accelerations`.
         self.mujoco.mj_solveM(self.world, d, self.response, self.force_map)

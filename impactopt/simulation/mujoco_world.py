@@ -353,9 +353,9 @@ class MujocoRobot:
     world, data : MuJoCo's model and its data
     dof, qpos_index : indices of the joints' rates in qvel and angles in qpos
     sites : of the h striking points
-    normal_jacobian (h, nv) : of their speeds along the normal, at the last call of `update_contact`
+    normal_jacobian (h, nv) : of their speeds along the normal, at the last call of `speeds_along`
     force_map (h, nv) : generalized forces of a unit of normal force at each, friction included;
-        without friction the same array; that of bristles is set by `bend`
+        without friction the same array; with friction, `update_friction` and `bend` set it
     deflections (h, 3), normal_forces (h,) : of the bristles [m], and the last forces [N] of `bend`
     mobility : inverse mass [1/kg] of the target across the normal, see `tangential_mobility`
     tangential (2, 3) : displacement [m] and velocity [m/s] of the target across the normal
@@ -377,8 +377,8 @@ class MujocoRobot:
         self.dof = np.array([joint.dofadr[0] for joint in joints])
         self.qpos_index = np.array([joint.qposadr[0] for joint in joints])
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
-        self._jacobian, self.normal_jacobian = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
-        self._site_type, self._velocity = self.mujoco.mjtObj.mjOBJ_SITE, np.zeros(6)
+        self._jacobians = np.zeros((len(strikers), 3, world.nv))  # of the striking points' velocities
+        self.normal_jacobian = np.zeros((len(strikers), world.nv))
         self.sliding = None if friction is None else SlidingPoints(friction)
         self.deflections, self.normal_forces = np.zeros((len(strikers), 3)), np.zeros(len(strikers))
         self.mobility, self.tangential = mobility, np.zeros((2, 3))
@@ -419,28 +419,20 @@ class MujocoRobot:
         return np.asarray(self.data.site_xpos[self.sites])
 
     def speeds_along(self, normal: Array) -> Array:
-        """Speeds (h,) [m/s] of the striking points along a normal (3,)."""
-        velocity, speeds = self._velocity, []
-        for site in self.sites:
-            # angular, then linear, in world axes
-            self.mujoco.mj_objectVelocity(self.world, self.data, self._site_type, site, velocity, 0)
-            speeds.append(normal @ velocity[3:])
-        return np.array(speeds)
-
-    def update_contact(self, normal: Array) -> None:
-        """Updates `normal_jacobian` and `force_map`, that of bristles for the last normal forces.
-
-        normal (3,) : of the contact.
-        """
-        J, jacobians = self._jacobian, []
+        """Speeds (h,) [m/s] of the striking points along a normal (3,); updates `normal_jacobian`."""
         for k, site in enumerate(self.sites):
-            self.mujoco.mj_jacSite(self.world, self.data, J, None, site)
-            self.normal_jacobian[k] = normal @ J
-            if self.sliding is not None:
-                jacobians.append(J.copy())
+            self.mujoco.mj_jacSite(self.world, self.data, self._jacobians[k], None, site)
+            self.normal_jacobian[k] = normal @ self._jacobians[k]
+        return np.asarray(self.normal_jacobian @ self.data.qvel)
+
+    def update_friction(self, normal: Array) -> None:
+        """Updates the force map of friction, that of bristles for the last normal forces.
+
+        normal (3,) : of the last `speeds_along`.
+        """
         if self.sliding is not None:
             self.sliding.surface = self.tangential[1]
-            self.sliding.update(normal, jacobians, self.data.qvel)
+            self.sliding.update(normal, self._jacobians, self.data.qvel)
             self.force_map = self.sliding.force_map(self.deflections, self.normal_forces)
 
     def release(self, step: float) -> None:

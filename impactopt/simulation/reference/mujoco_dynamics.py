@@ -191,7 +191,7 @@ def march(
     while True:
         world.mujoco.mj_step1(world.world, data)  # up to velocities; forces are set before mj_step2
         speed = float(world.speeds_along(normal)[0])
-        world.update_contact(normal)
+        world.update_friction(normal)
         if k == 0:
             start = float(normal @ world.striking_points()[0])
         if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):

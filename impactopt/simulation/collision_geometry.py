@@ -190,7 +190,7 @@ class UnintendedContacts:
 
     def __init__(self, world: Any, solids: Solids) -> None:
         self._names = np.array(["ground", *(s.name for s in solids.solids)])
-        self._number = np.full(world.ngeom, -1)  # of each geom: index in the names, or -1
+        self._number = [-1] * world.ngeom  # of each geom: index in the names, or -1
         self._number[0] = 0
         for k in range(world.ngeom):
             kind, _, number = world.geom(k).name.partition(" ")
@@ -208,14 +208,12 @@ class UnintendedContacts:
         """Records the contacts at a time [s]; to be called once a step's forces are known."""
         if not data.ncon:
             return
-        contacts = data.contact
-        numbers = self._number[contacts.geom]
-        both = numbers.min(axis=1) >= 0
-        if not both.any():
-            return
-        for k in np.flatnonzero(both & (contacts.dist < 0)):
+        contacts, number = data.contact, self._number
+        for k, (first, second) in enumerate(contacts.geom.tolist()):  # few: no array is as fast
             # a pair has one entry, whichever of its geoms MuJoCo names first
-            one, other = (int(n) for n in sorted(numbers[k], reverse=True))
+            other, one = sorted((number[first], number[second]))
+            if other < 0 or contacts.dist[k] >= 0:
+                continue
             # -1: MuJoCo has left the contact out; else its first constraint is the normal one
             address = contacts.efc_address[k]
             force = float(data.efc_force[address]) if address >= 0 else 0.0

@@ -7,6 +7,8 @@ velocities, feed-forward), the robot's parameters and the scene.
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import replace
 from typing import Any
@@ -39,6 +41,7 @@ from impactopt.simulation.result import (
     Simulation,
     Touches,
     check_not_diverged,
+    cross,
     posture_error,
     simulation_of,
     stance_at,
@@ -46,7 +49,7 @@ from impactopt.simulation.result import (
 from impactopt.simulation.target_dynamics import Push, TargetContact
 
 Array = NDArray[np.float64]
-AXES, NEXT_AXES, PREVIOUS_AXES = np.arange(3), [1, 2, 0], [2, 0, 1]
+AXES = np.arange(3)
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where the body of a broken target goes
 # A robot has fallen beyond these errors of its base: tilt [rad], and loss of height, over the height of the
 # centre of mass at the start, as the base's own origin may lie on the ground
@@ -105,8 +108,8 @@ class _Replay(MujocoRobot):
         self.placed: tuple[Array | None, float, bool] = (None, 0.0, False)
         # depths of the striking points at the end of the last step, None if it had no contact
         self.last_depths: Array | None = None
-        # speeds of the striking points in the last step, and forces on them
-        self.last_step: tuple[Array, Array] | None = None
+        # speeds of the striking points in the last step, and forces on them (None: no contact was near)
+        self.last_step: tuple[Array, Array | None] | None = None
         # decelerations (h, nv) of the robot by a unit of each contact force; None: no contact is near
         self.response: Array | None = None
         self.sole_index = {name: k for k, name in enumerate(scene.soles)}
@@ -145,8 +148,8 @@ class _Replay(MujocoRobot):
             return self.servo.torque(t, d.qpos[self.qpos_index], d.qvel[self.dof])
         _, v = self.state()
         rotation = self.base_rotation() if self.floating else np.eye(3)
-        demand = self.wbc.torque(t, d.qpos[self.qpos_index], v, rotation, forces)
-        return demand, np.clip(demand, -self.servo.limit, self.servo.limit)
+        demand, limit = self.wbc.torque(t, d.qpos[self.qpos_index], v, rotation, forces), self.servo.limit
+        return demand, np.minimum(np.maximum(demand, -limit), limit)
 
     def start(self, q: Array) -> None:
         """Puts the robot at q (nq,), and welds supporting hands there."""
@@ -190,8 +193,8 @@ class _Replay(MujocoRobot):
             self.world.site_pos[site] = d.xmat[body].reshape(3, 3).T @ (place - d.xpos[body])
             d.site_xpos[site] = place
 
-    def push(self, speeds: Array, step: float) -> Push:
-        """Contact forces in the step that begins now; advances the target.
+    def push(self, speeds: Array, step: float) -> Push | None:
+        """Contact in the step that begins now, None if no contact is near; advances the target.
 
         speeds : (h,) [m/s] of the striking points along the normal.
 
@@ -201,27 +204,29 @@ class _Replay(MujocoRobot):
         contact, d, zero = self.contact, self.data, 0.0 * speeds
         depths = zero - np.inf if self.perturbation.missing else self.depths
         self.response = None
-        if contact.near(depths, speeds, self.target, step):
-            self.response = np.zeros_like(self.normal_jacobian)
-            # M is the free robot's: MuJoCo's contacts hold the soles, and their effect is in `accelerations`.
-            self.mujoco.mj_solveM(self.world, d, self.response, self.force_map)
-            inverse_mass = self.normal_jacobian @ self.response.T
-            # speeds' change minus that by the contact forces of the last step, -M^-1 f
-            accelerations = zero if self.last_step is None else (speeds - self.last_step[0]) / step
-            accelerations = accelerations + (
-                zero if self.last_step is None else inverse_mass @ self.last_step[1]
+        if not contact.near(depths, speeds, self.target, step):
+            self.target, self.travel = contact.untouched_step(self.target, self.travel, step)
+            self.release(step)
+            self.last_step = speeds, None
+            return None
+        self.update_friction(self.scene.normal)
+        self.response = np.zeros_like(self.normal_jacobian)
+        # M is the free robot's: MuJoCo's contacts hold the soles, and their effect is in `accelerations`.
+        self.mujoco.mj_solveM(self.world, d, self.response, self.force_map)
+        inverse_mass = self.normal_jacobian @ self.response.T
+        # speeds' change minus that by the contact forces of the last step, -M^-1 f
+        accelerations = zero
+        if self.last_step is not None:
+            before, forces = self.last_step
+            accelerations = (speeds - before) / step + (zero if forces is None else inverse_mass @ forces)
+        push = contact.pushed(depths, speeds, accelerations, inverse_mass, self.target, self.travel, step)
+        self.last_depths = push.depths
+        if self.links is not None:  # to depths of the points in the target's plane, as in `hand_speeds`
+            self.last_depths = (
+                self.last_depths
+                + contact.depths(self.striking_points() - self.tangential[0], self.travel)
+                - depths
             )
-            push = contact.pushed(depths, speeds, accelerations, inverse_mass, self.target, self.travel, step)
-            self.last_depths = push.depths
-            if self.links is not None:  # to depths of the points in the target's plane, as in `hand_speeds`
-                self.last_depths = (
-                    self.last_depths
-                    + contact.depths(self.striking_points() - self.tangential[0], self.travel)
-                    - depths
-                )
-        else:
-            state, travel = contact.untouched_step(self.target, self.travel, step)
-            push = Push(forces=zero, first_half=zero, peaks=zero, state=state, travel=travel, depths=depths)
         self.bend(push.forces, step)
         self.last_step = (speeds, push.forces)
         self.target, self.travel = push.state, push.travel
@@ -248,11 +253,11 @@ class _Replay(MujocoRobot):
         self.placed = self.target, self.travel, broken
 
     # ---------------------------------------------------------------- recorded quantities
-    def record_gears(self, gears: GearWatch, torque: Array, push: Push) -> None:
+    def record_gears(self, gears: GearWatch, torque: Array, push: Push | None) -> None:
         """Records gear loads after a step with motor torques (n,) [N m] and the contact forces `push`."""
         acceleration = self.data.qacc[self.dof]
         gears.update(torque, acceleration)
-        if self.response is not None:  # at the peak of the forces, instead of their mean
+        if push is not None and self.response is not None:  # at the peak of the forces, instead of their mean
             gears.update(torque, acceleration + (push.forces - push.peaks) @ self.response[:, self.dof])
 
     def corner_places(self) -> Array:
@@ -275,9 +280,7 @@ class _Replay(MujocoRobot):
         # the frame's first axis points from the first geom to the second: from the floor, geom 0, up
         parts = self.data.efc_force[contacts.efc_address[on][:, None] + AXES]
         force = (parts[:, None] @ axes)[:, 0]
-        # place x force; np.cross takes several times as long
-        moment = place[:, NEXT_AXES] * force[:, PREVIOUS_AXES] - place[:, PREVIOUS_AXES] * force[:, NEXT_AXES]
-        np.add.at(out, sole[on], np.concatenate([force, moment], axis=1))
+        np.add.at(out, sole[on], np.concatenate([force, cross(place, force)], axis=1))
         return out
 
     def ground(self) -> Array:
@@ -288,7 +291,7 @@ class _Replay(MujocoRobot):
         if not self.grips.frames:
             return self.sole_ground()
         wrenches, places = self.grips.wrenches(self.data)
-        wrenches[:, 3:] += np.cross(places, wrenches[:, :3])
+        wrenches[:, 3:] += cross(places, wrenches[:, :3])
         return np.vstack([self.sole_ground(), wrenches])
 
     def fallen(self, t: float) -> str:
@@ -300,11 +303,11 @@ class _Replay(MujocoRobot):
         if not self.scene.soles:
             return ""
         times = self.servo.time
-        now = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
+        now = max(bisect_right(times, t) - 1, 0)
         since = now
         if self.wbc is not None and self.wbc.tracking.recovers(t):
-            since = min(int(np.searchsorted(times, self.wbc.tracking.contact[1])), now)
-        lean = float(self.base_errors(slice(since, now + 1)).min())
+            since = min(bisect_left(times, self.wbc.tracking.contact[1]), now)
+        lean = self.base_error(slice(since, now + 1))
         height, planned = self.data.qpos[2], float(self.reference_q[since : now + 1, 2].min())
         if lean > FALLEN_TILT:
             return f"fell: the base leans {lean:.1f} rad from where it should be"
@@ -312,16 +315,17 @@ class _Replay(MujocoRobot):
             return f"fell: the base is {height:.2f} m high where it should be {planned:.2f} m"
         return ""
 
-    def base_errors(self, instants: slice) -> Array:
-        """Angles [rad] between the vertical axes of the base and of the reference at these instants."""
+    def base_error(self, instants: slice) -> float:
+        """Least angle [rad] between the vertical axes of the base and of the reference at these instants."""
         w, x, y, z = self.data.qpos[3:7].tolist()
-        return np.arccos(np.clip(self.upright[instants] @ _upright((x, y, z, w)), -1.0, 1.0))
+        cosine = float((self.upright[instants] @ _upright((x, y, z, w))).max())
+        return math.acos(min(max(cosine, -1.0), 1.0))
 
     def not_standing(self, simulation: Simulation) -> str:
         """Reason why the robot does not stand at the end of the simulation; "" if it does."""
         if not self.scene.soles:
             return ""
-        lean, speed = float(self.base_errors(slice(-1, None))[0]), float(np.linalg.norm(self.data.qvel[:3]))
+        lean, speed = self.base_error(slice(-1, None)), float(np.linalg.norm(self.data.qvel[:3]))
         if lean > STANDING_TILT:
             return f"leans at the end: base {lean:.2f} rad from where it should be"
         if speed > STANDING_SPEED:
@@ -401,7 +405,8 @@ def simulate_mujoco(
     waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # step in which a command takes effect; command
     # (2, n) demand, and demand after saturation: as commanded, and as it reaches the motors
     commanded, reached = np.zeros((2, robot.n)), np.zeros((2, robot.n))
-    forces = np.zeros(len(scene.strikers))
+    none = np.zeros(len(scene.strikers))
+    forces = none  # [N] of the last step
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     recorded: list[tuple[Any, ...]] = []
     touches, saturated, fall = Touches(), 0.0, ""
@@ -411,7 +416,7 @@ def simulate_mujoco(
     drive: Array | None = None  # torque of the motors
     gears = GearWatch(robot)
     # [N s] of each striker on the target, and the target's state at the last touch
-    impulses, last_touched = np.zeros(len(scene.strikers)), replay.target
+    impulses, last_touched = none, replay.target
     with no_log_file():
         for k in range(round(min(float(reference.end) + beyond, until) / step)):
             t = k * step
@@ -428,7 +433,7 @@ def simulate_mujoco(
             motor_delay.keep(t, commanded)
             if reached is not previous:
                 demand, saturated_demand = reached
-                saturates = bool((np.abs(demand) > limit).any())
+                saturates = bool(np.count_nonzero(np.abs(demand) > limit))
             rates = data.qvel[replay.dof]
             cut = motors.cut(saturated_demand, rates)
             if motors.lines:
@@ -442,14 +447,15 @@ def simulate_mujoco(
             speeds = replay.hand_speeds()
             target_before, aside = replay.target, replay.tangential[0]
             push = replay.push(speeds, step)
-            forces = push.forces
-            replay.apply(torque, push.forces)
+            forces = none if push is None else push.forces
+            replay.apply(torque, None if push is None else forces)
             replay.apply_perturbation(t)
-            touches.add(t + push.times, push.total, push.given)
+            touches.add(t, push)
             saturated += step * saturates
             replay.place_target()
-            impulses += step * push.forces
-            last_touched = replay.target if push.given[-1] > 0 else last_touched
+            if push is not None:
+                impulses = impulses + step * forces
+                last_touched = replay.target if push.given[-1] > 0 else last_touched
             records = k % record == 0 or touches.touched
             # positions are those before the step, forces and accelerations those in it
             state = replay.state() if records else None
@@ -460,7 +466,8 @@ def simulate_mujoco(
             if records:
                 ground = replay.ground()
                 assert state is not None
-                contact_values = float(push.total[0]), replay.contact.speed(target_before), float(speeds[0])
+                force = 0.0 if push is None else float(push.total[0])
+                contact_values = force, replay.contact.speed(target_before), float(speeds[0])
                 loads = demand, torque, ground, corners, gears.take()
                 recorded.append((t, *state, *contact_values, aside, *loads, stance_at(now, t)))
                 check_not_diverged(data.qvel, t, step)

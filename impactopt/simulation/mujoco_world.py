@@ -89,7 +89,21 @@ def build_world(
     spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver, scene.solids.floor)
     _solids(mujoco_module(), spec, bodies, scene, near, in_contact)
     add_welds(spec, bodies, robot, scene.hands, solver.step)
-    return spec.compile()
+    world = spec.compile()
+    _tighten_balls(mujoco_module(), world)
+    return world
+
+
+def _tighten_balls(mujoco: Any, world: Any) -> None:
+    """Sets the enclosing balls of meshes, outside which MuJoCo computes no contact, to their vertices.
+
+    MuJoCo's own enclose the meshes' boxes: twice as many pairs of links come near enough for an exact test.
+    """
+    for geom in np.flatnonzero(world.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
+        mesh = world.geom_dataid[geom]
+        first, count = world.mesh_vertadr[mesh], world.mesh_vertnum[mesh]
+        vertices = world.mesh_vert[first : first + count].astype(np.float64)
+        world.geom_rbound[geom] = np.linalg.norm(vertices, axis=1).max() * (1 + 1e-9)
 
 
 def robot_on_floor(
@@ -341,7 +355,7 @@ class MujocoRobot:
     sites : of the h striking points
     normal_jacobian (h, nv) : of their speeds along the normal, at the last call of `speeds_along`
     force_map (h, nv) : generalized forces of a unit of normal force at each, friction included;
-        without friction the same array; that of bristles is set by `bend`
+        without friction the same array; with friction, `update_friction` and `bend` set it
     deflections (h, 3), normal_forces (h,) : of the bristles [m], and the last forces [N] of `bend`
     mobility : inverse mass [1/kg] of the target across the normal, see `tangential_mobility`
     tangential (2, 3) : displacement [m] and velocity [m/s] of the target across the normal
@@ -363,7 +377,8 @@ class MujocoRobot:
         self.dof = np.array([joint.dofadr[0] for joint in joints])
         self.qpos_index = np.array([joint.qposadr[0] for joint in joints])
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
-        self._jacobian, self.normal_jacobian = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
+        self._jacobians = np.zeros((len(strikers), 3, world.nv))  # of the striking points' velocities
+        self.normal_jacobian = np.zeros((len(strikers), world.nv))
         self.sliding = None if friction is None else SlidingPoints(friction)
         self.deflections, self.normal_forces = np.zeros((len(strikers), 3)), np.zeros(len(strikers))
         self.mobility, self.tangential = mobility, np.zeros((2, 3))
@@ -404,21 +419,27 @@ class MujocoRobot:
         return np.asarray(self.data.site_xpos[self.sites])
 
     def speeds_along(self, normal: Array) -> Array:
-        """Speeds (h,) [m/s] of the striking points along a normal (3,).
-
-        Updates `normal_jacobian` and `force_map`, that of bristles for the last normal forces.
-        """
-        J, jacobians = self._jacobian, []
+        """Speeds (h,) [m/s] of the striking points along a normal (3,); updates `normal_jacobian`."""
         for k, site in enumerate(self.sites):
-            self.mujoco.mj_jacSite(self.world, self.data, J, None, site)
-            self.normal_jacobian[k] = normal @ J
-            if self.sliding is not None:
-                jacobians.append(J.copy())
+            self.mujoco.mj_jacSite(self.world, self.data, self._jacobians[k], None, site)
+            self.normal_jacobian[k] = normal @ self._jacobians[k]
+        return np.asarray(self.normal_jacobian @ self.data.qvel)
+
+    def update_friction(self, normal: Array) -> None:
+        """Updates the force map of friction, that of bristles for the last normal forces.
+
+        normal (3,) : of the last `speeds_along`.
+        """
         if self.sliding is not None:
             self.sliding.surface = self.tangential[1]
-            self.sliding.update(normal, jacobians, self.data.qvel)
+            self.sliding.update(normal, self._jacobians, self.data.qvel)
             self.force_map = self.sliding.force_map(self.deflections, self.normal_forces)
-        return np.asarray(self.normal_jacobian @ self.data.qvel)
+
+    def release(self, step: float) -> None:
+        """Advances a target that moves across the normal by a step [s] without contact; releases bristles."""
+        if self.sliding is not None:
+            self.deflections, self.normal_forces = 0.0 * self.deflections, 0.0 * self.normal_forces
+            self.tangential = np.array([self.tangential[0] + step * self.tangential[1], self.tangential[1]])
 
     def bend(self, forces: Array, step: float) -> None:
         """Advances the bristles by a step [s] under normal forces (h,) [N], and sets `force_map`.
@@ -434,10 +455,10 @@ class MujocoRobot:
             velocity = self.tangential[1] + step * self.mobility * self.sliding.on_target(forces)
             self.tangential = np.array([self.tangential[0] + step * velocity, velocity])
 
-    def apply(self, torque: Array, forces: Array | float) -> None:
+    def apply(self, torque: Array, forces: Array | None) -> None:
         """Applies torques (n,) [N m] at the joints, and contact forces (h,) [N] against the normal."""
         applied = self.data.qfrc_applied
-        applied[:] = -np.atleast_1d(forces) @ self.force_map
+        applied[:] = 0.0 if forces is None else -forces @ self.force_map
         applied[self.dof] += torque
 
 

@@ -23,6 +23,7 @@ from impactopt.simulation.result import (
     Simulation,
     Touches,
     check_not_diverged,
+    cross,
     posture_error,
     simulation_of,
     stance_at,
@@ -47,21 +48,25 @@ class _State:
 
 
 @dataclass(frozen=True)
-class _Rates:
-    """Rates of a state, with forces and torques."""
+class _Torques:
+    """Torques (n,) [N m] in a state, from the servo to the joints."""
 
-    v: Array
-    a: Array
-    target_speed: float  # [m/s]
-    forces: Array  # (h,) of each striker [N]
-    hand_speed: float  # of the first striking point along the normal [m/s]
-    # torques (n,) [N m], from the servo to the joints:
     commanded: Array  # (2, n) demand of the servo, and the demand after saturation
     demand: Array  # demand that reaches the motors, after the delay
     saturated: Array  # the same after saturation
     cut: Array  # after the motors' torque-speed lines
-    torque: Array  # of the motors in this state, which follow `cut` with their time constant
-    push: Push | None  # contact in the step that begins here; None: there is none
+    motors: Array  # of the motors in this state, which follow `cut` with their time constant
+
+
+@dataclass(frozen=True)
+class _Rates:
+    """Accelerations, contact and torques in the state in which a step begins."""
+
+    a: Array
+    hand_speed: float  # of the first striking point along the normal [m/s]
+    torques: _Torques
+    forces: Array | None  # (h,) of each striker [N]; None: no contact is near
+    push: Push | None  # contact in the step; None: no contact is near
 
 
 class _World:
@@ -137,26 +142,26 @@ class _World:
             return np.full(len(self.scene.strikers), -np.inf)
         return self.contact.depths(self.body.striking_points() - s.tangential[0], s.travel)
 
-    def rates(self, t: float, s: _State, *, forces: Array | None = None, step: float = 0.0) -> _Rates:
-        """Rates of a state.
-
-        forces : (h,) [N] of the contact, as known for a state in the middle of a step; None: they follow from
-            the state, and the contact is integrated over the step [s] that begins here.
-        """
-        body = self.body
-        speed = body.update(s.q, s.v)
-        speeds, depths = body.normal_jacobian @ s.v, self.depths(s)
+    def torques(self, t: float, s: _State) -> _Torques:
+        """Torques in a state at a time [s]."""
         joints = s.v[self.base :]
         commanded = np.array(self.servo.torque(t, self.robot.angles.of(s.q), joints))
         demand, saturated = self.delay.at(t, commanded)
         cut = self.motors.cut(saturated, joints)
-        torque = self.motors.now(s.drive, cut)
-        push, contact, inside = None, self.contact, forces is None
-        forces = contact.forces(depths, speeds, s.target) if forces is None else forces
-        body.bend(s.deflections, forces, s.tangential[1])
-        if inside and contact.near(depths, speeds, s.target, step):
+        return _Torques(commanded, demand, saturated, cut, self.motors.now(s.drive, cut))
+
+    def rates(self, t: float, s: _State, step: float) -> _Rates:
+        """Rates of a state; the contact is integrated over the step [s] that begins in it."""
+        body, contact, torques = self.body, self.contact, self.torques(t, s)
+        body.update(s.q, s.v)
+        speeds, depths, torque = body.speeds(), self.depths(s), torques.motors
+        push = forces = None
+        if contact.near(depths, speeds, s.target, step):
+            body.update_contact()
+            forces = contact.forces(depths, speeds, s.target)
+            body.bend(s.deflections, forces, s.tangential[1])
             units = np.eye(len(speeds))
-            a = body.accelerate(torque, 0.0 * speeds)
+            a = body.accelerate(torque, None)
             # Accelerations are affine in the contact forces: differences with unit forces give the
             # response, and with it J P J', whatever is fixed, without inverting H.
             response = np.column_stack([a - body.accelerate(torque, unit) for unit in units])
@@ -164,24 +169,12 @@ class _World:
             push = contact.pushed(
                 depths, speeds, body.normal_accelerations(a), inverse_mass, s.target, s.travel, step
             )
-        return _Rates(
-            v=s.v.copy(),
-            a=body.accelerate(torque, forces),
-            target_speed=contact.speed(s.target),
-            forces=forces,
-            hand_speed=speed,
-            commanded=commanded,
-            demand=demand,
-            saturated=saturated,
-            cut=cut,
-            torque=torque,
-            push=push,
-        )
+        return _Rates(body.accelerate(torque, forces), float(speeds[0]), torques, forces, push)
 
     def ground(self) -> Array:
         """Wrenches (soles and hands, 6) of the world on them, about its origin, of the last `rates`."""
         wrenches = self.body.wrenches()
-        wrenches[:, 3:] += np.cross(self.body.origins(), wrenches[:, :3])
+        wrenches[:, 3:] += cross(self.body.origins(), wrenches[:, :3])
         out = np.zeros((len(self.scene.soles) + len(self.scene.hands), 6))
         out[self.fixed] = wrenches
         return out
@@ -200,14 +193,14 @@ class _World:
         found = self.scene.target.outcome(last_touched)
         return found | tangential_outcome(s.tangential[1]) if self.mobility else found
 
-    def _pushed_tangentially(self, before: Array, s: _State, forces: Array, h: float) -> Array:
-        """`_State.tangential` after a step [s] from `before`, by the rates in the state of the last `rates`.
+    def _pushed_tangentially(self, before: Array, s: _State, forces: Array | None, h: float) -> Array:
+        """`_State.tangential` after a step [s] from `before`, by the rates in the body's state `s`.
 
-        forces : (h,) [N] normal ones.
+        forces : (h,) [N] normal ones; None: there is no contact.
         """
         if not self.mobility or self.body.sliding is None:
             return before
-        friction = self.body.sliding.on_target(forces)
+        friction = np.zeros(3) if forces is None else self.body.sliding.on_target(forces)
         return before + h * np.array([s.tangential[1], self.mobility * friction])
 
     def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:
@@ -215,12 +208,15 @@ class _World:
 
         first : rates at the state `s`, for which they must have been evaluated last.
         """
-        push = first.push
-        a = first.a
-        if push is not None and np.any(push.first_half != first.forces):
-            a = self.body.accelerate(first.torque, push.first_half)
-        bent = first.forces if push is None else push.first_half
-        deflections = self.body.deflected(s.deflections, bent, h / 2)
+        push, body = first.push, self.body
+        a, bent, forces = first.a, None, None
+        if push is not None:
+            # Mean forces of the whole step, so that momentum is exchanged exactly as the target's integration
+            # has it; in its first half, those of that half.
+            bent, forces = push.first_half, push.forces
+            if np.any(bent != first.forces):
+                a = body.accelerate(first.torques.motors, bent)
+        deflections = body.deflected(s.deflections, bent, h / 2)
         tangential = self._pushed_tangentially(s.tangential, s, bent, h / 2)
         half = _State(
             # explicit midpoint rule: half a step by the rates at the start, then a whole one by the rates in
@@ -230,32 +226,34 @@ class _World:
             travel=s.travel,
             target=s.target,
             impulses=s.impulses,
-            drive=self.motors.after(s.drive, first.cut, h / 2),
+            drive=self.motors.after(s.drive, first.torques.cut, h / 2),
             deflections=deflections,
             tangential=tangential,
         )
-        # mean forces of the whole step, so that momentum is exchanged exactly as the target's integration has
-        # it
-        middle = self.rates(t + h / 2, half, forces=0.0 * first.forces if push is None else push.forces)
+        middle = self.torques(t + h / 2, half)
+        body.update(half.q, half.v)
+        if forces is not None:
+            body.update_contact()
+            body.bend(half.deflections, forces, half.tangential[1])
         if push is None:
             target, travel = self.contact.untouched_step(s.target, s.travel, h)
         else:
             target, travel = push.state, push.travel
         after = _State(
-            q=pin.integrate(self.model, s.q, h * middle.v),
-            v=s.v + h * middle.a,
+            q=pin.integrate(self.model, s.q, h * half.v),
+            v=s.v + h * body.accelerate(middle.motors, forces),
             travel=travel,
             target=target,
-            impulses=s.impulses + h * middle.forces,
+            impulses=s.impulses if forces is None else s.impulses + h * forces,
             drive=self.motors.after(s.drive, middle.cut, h),
-            deflections=self.body.deflected(s.deflections, middle.forces, h),
-            tangential=self._pushed_tangentially(s.tangential, half, middle.forces, h),
+            deflections=body.deflected(s.deflections, forces, h),
+            tangential=self._pushed_tangentially(s.tangential, half, forces, h),
         )
         if push is None:
             return after
         # The contact's integration gives depths more exactly than the midpoint rule gives the robot: take the
         # travel that makes them agree.
-        self.body.update(after.q, after.v)
+        body.update(after.q, after.v)
         travels = self.depths(replace(after, travel=0.0)) - push.depths
         # a point beside the target's surface has no depth
         known = travels[np.isfinite(travels)]
@@ -305,15 +303,15 @@ def follow_contact(
         since = k * step
         if since >= until and not touches.touching:
             break
-        first = world.rates(start + since, state, step=step)
-        world.delay.keep(start + since, first.commanded)
+        first = world.rates(start + since, state, step)
+        world.delay.keep(start + since, first.torques.commanded)
         push = first.push
-        _add(touches, since, push)
-        before, state = state, world.step(start + since, state, first, step)
+        touches.add(since, push)
+        state = world.step(start + since, state, first, step)
         now = world.contact.side(state.target, 0.0 if push is None else float(push.total[-1]))
         events += [since + step] if now != side else []
         side = now
-        last_touched = state.target if state.impulses.sum() > before.impulses.sum() else last_touched
+        last_touched = state.target if push is not None and push.given[-1] > 0 else last_touched
         check_not_diverged(state.v, start + since, step)
     return Followed(
         impulse=float(state.impulses.sum()),
@@ -322,12 +320,6 @@ def follow_contact(
         touches=tuple((start, end) for start, end, _ in touches.intervals),
         events=tuple(events),
     )
-
-
-def _add(touches: Touches, t: float, push: Push | None) -> None:
-    """Records the contact in a step that begins at a time [s]; None: there is none."""
-    none = np.zeros(1)
-    touches.add(t + none, none, none) if push is None else touches.add(t + push.times, push.total, push.given)
 
 
 def simulate_pinocchio(
@@ -371,22 +363,24 @@ def simulate_pinocchio(
         if (now := followed.at(t, bool(touches.intervals))) is not world.followed:
             world.follow(now)
         state = world.switch_stance(t, state)
-        first = world.rates(t, state, step=step)
-        world.delay.keep(t, first.commanded)
-        cuts.update(t, first.saturated, first.cut, step)
-        push = first.push
-        saturated += step * bool(np.any(np.abs(first.demand) > world.servo.limit))
-        _add(touches, t, push)
-        gears.update(first.torque, first.a)
+        first = world.rates(t, state, step)
+        torques, push = first.torques, first.push
+        world.delay.keep(t, torques.commanded)
+        if world.motors.lines:
+            cuts.update(t, torques.saturated, torques.cut, step)
+        saturated += step * bool(np.count_nonzero(np.abs(torques.demand) > world.servo.limit))
+        touches.add(t, push)
+        gears.update(torques.motors, first.a)
         if touches.touched or k % record == 0:
-            motion = (state.q, state.v, float(first.forces.sum()), first.target_speed, first.hand_speed)
+            force = 0.0 if first.forces is None else float(first.forces.sum())
+            motion = (state.q, state.v, force, world.contact.speed(state.target), first.hand_speed)
             recorded.append(
                 (
                     t,
                     *motion,
                     state.tangential[0],
-                    first.demand,
-                    first.torque,
+                    torques.demand,
+                    torques.motors,
                     world.ground(),
                     world.corners(),
                     gears.take(),
@@ -394,9 +388,9 @@ def simulate_pinocchio(
                 )
             )
         if push is not None:  # forces jump within the step in which a contact begins
-            gears.update(first.torque, world.body.accelerate(first.torque, push.peaks))
-        before, state = state, world.step(t, state, first, step)
-        last_touched = state.target if state.impulses.sum() > before.impulses.sum() else last_touched
+            gears.update(torques.motors, world.body.accelerate(torques.motors, push.peaks))
+        state = world.step(t, state, first, step)
+        last_touched = state.target if push is not None and push.given[-1] > 0 else last_touched
         check_not_diverged(state.v, t, step)
     return simulation_of(
         robot,

@@ -36,9 +36,10 @@ class Body(ABC):
     normal : (3,) of the impact.
     friction : of the striking points on the target.
 
-    `normal_jacobian` (h, nv) gives the speeds of the h striking points along the normal. `force_map` (h, nv)
-    maps a unit of normal force at each, friction included, to generalized forces; without friction both are
-    the same. That of bristles, and of a target that friction moves, is set by `bend`.
+    `update_contact` sets, for contact forces at the h striking points, their `jacobians` (3, nv);
+    `normal_jacobian` (h, nv), of their speeds along the normal; and `force_map` (h, nv), which maps a unit of
+    normal force at each, friction included, to generalized forces. Without friction the latter two are the
+    same. The force map of bristles, and of a target that friction moves, is set by `bend`.
     """
 
     def __init__(
@@ -59,18 +60,22 @@ class Body(ABC):
         self._unbent = np.zeros((len(strikers), 3)), np.zeros(len(strikers))
         self.strikers = [self.model.getFrameId(name) for name in strikers]
         self.sliding = None if friction is None else SlidingPoints(friction)
+        self.jacobians: list[Array] = []
         self.normal_jacobian = self.force_map = np.zeros((len(strikers), self.nv))
 
-    @abstractmethod
-    def update(self, q: Array, v: Array) -> float:
-        """Sets q (nq,), v (nv,); returns the speed of the first striking point along the normal [m/s]."""
+    def update(self, q: Array, v: Array) -> None:
+        """Sets q (nq,), v (nv,)."""
+        self._state = q, v
+        if self.robot.springs:
+            self._springs = self.robot.spring_torque(q)
 
     @abstractmethod
-    def accelerate(self, torque: Array, force: float | Array) -> Array:
+    def accelerate(self, torque: Array, force: float | Array | None) -> Array:
         """Acceleration (nv,) in the current state.
 
         torque : (n,) [N m] at the joints, friction included.
-        force : [N] on the striking point against the normal; of several, (h,).
+        force : [N] on the striking point against the normal; of several, (h,); None: there is no contact.
+            Others need `update_contact`.
         """
 
     @abstractmethod
@@ -79,10 +84,9 @@ class Body(ABC):
 
     def fastest_rate(self, damping: Array) -> float:
         """Largest rate [1/s] at which joint damping (n, n) alone slows the joints, in the current state."""
-        no_force = np.zeros(len(self.strikers))
-        without = self.accelerate(np.zeros(self.n), no_force)
+        without = self.accelerate(np.zeros(self.n), None)
         # columns of d a / d tau; times the damping, they give the rates at which velocities decay
-        by_torque = [(self.accelerate(unit, no_force) - without)[-self.n :] for unit in np.eye(self.n)]
+        by_torque = [(self.accelerate(unit, None) - without)[-self.n :] for unit in np.eye(self.n)]
         return float(np.abs(np.linalg.eigvals(np.column_stack(by_torque) @ damping)).max())
 
     def striking_points(self) -> Array:
@@ -90,6 +94,11 @@ class Body(ABC):
         return np.array(
             [pin.updateFramePlacement(self.model, self.data, i).translation for i in self.strikers]
         )
+
+    def speeds(self) -> Array:
+        """Speeds (h,) [m/s] of the striking points along the normal, in the current state."""
+        velocities = [pin.getFrameVelocity(self.model, self.data, i, _AXES).linear for i in self.strikers]
+        return np.array(velocities) @ self.normal
 
     def placements(self) -> list[pin.SE3]:
         """Placements of the fixed frames in the world, in the current state."""
@@ -103,15 +112,12 @@ class Body(ABC):
         J = pin.getFrameJacobian(self.model, self.data, frame, _AXES)
         return np.reshape(J, (6, self.nv))  # a single column comes without its second dimension
 
-    def _update_contact(self, q: Array, v: Array) -> None:
-        """Sets `normal_jacobian`, `force_map` and the springs' torques; needs the joints' Jacobians."""
-        self._state = q, v
-        if self.robot.springs:
-            self._springs = self.robot.spring_torque(q)
-        jacobians = [self._jacobian(i)[:3] for i in self.strikers]
-        self.normal_jacobian = self.force_map = np.array([self.normal @ J for J in jacobians])
+    def update_contact(self) -> None:
+        """Sets `jacobians`, `normal_jacobian` and `force_map` in the current state."""
+        self.jacobians = [self._jacobian(i)[:3] for i in self.strikers]
+        self.normal_jacobian = self.force_map = np.array([self.normal @ J for J in self.jacobians])
         if self.sliding is not None:
-            self.sliding.update(self.normal, jacobians, v)
+            self.sliding.update(self.normal, self.jacobians, self._state[1])
             self.force_map = self.sliding.force_map(*self._unbent)
 
     def bend(self, deflections: Array, forces: Array, surface: Array) -> None:
@@ -123,10 +129,15 @@ class Body(ABC):
             self.sliding.surface = surface
             self.force_map = self.sliding.force_map(deflections, forces)
 
-    def deflected(self, deflections: Array, forces: Array, step: float) -> Array:
-        """Deflections (h, 3) [m] of bristles after a step [s] from the current state under normal forces."""
+    def deflected(self, deflections: Array, forces: Array | None, step: float) -> Array:
+        """Deflections (h, 3) [m] of bristles after a step [s] from the current state under normal forces.
+
+        Without contact, forces None, they are zero.
+        """
         if self.sliding is None or not self.sliding.bristles:
             return deflections
+        if forces is None:
+            return self._unbent[0]
         return self.sliding.deflected(deflections, forces, step)
 
     def after_touchdown(self, v: Array) -> Array:
@@ -143,9 +154,9 @@ class Body(ABC):
         motions = [pin.getFrameClassicalAcceleration(model, data, i, _AXES) for i in self.strikers]
         return np.array([self.normal @ motion.linear for motion in motions])
 
-    def _generalized_forces(self, torque: Array, force: float | Array) -> Array:
+    def _generalized_forces(self, torque: Array, force: float | Array | None) -> Array:
         """Generalized forces (nv,) of joint torques (n,), springs and contact forces (h,)."""
-        out = -np.atleast_1d(force) @ self.force_map
+        out = np.zeros(self.nv) if force is None else -np.atleast_1d(force) @ self.force_map
         out[-self.n :] += torque - self._springs
         return out
 
@@ -167,7 +178,8 @@ class DenseBody(Body):
         self._matrix[self.nv :, self.nv :] = np.diag(self.compliance)
         self._zero = np.zeros(self.nv)
 
-    def update(self, q: Array, v: Array) -> float:
+    def update(self, q: Array, v: Array) -> None:
+        super().update(q, v)
         model, data, nv = self.model, self.data, self.nv
         # with zero acceleration, a frame's classical acceleration is its drift dJ/dt v
         pin.forwardKinematics(model, data, q, v, self._zero)
@@ -178,12 +190,10 @@ class DenseBody(Body):
             self._matrix[rows, :nv] = J
             self._matrix[:nv, rows] = -J.T
             self._right[rows] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
-        self._update_contact(q, v)
         self._matrix[:nv, :nv] = mass_matrix(model, data, q)
         self._bias = pin.nonLinearEffects(model, data, q, v)  # springs are in `_generalized_forces`
-        return float(self.normal_jacobian[0] @ v)
 
-    def accelerate(self, torque: Array, force: float | Array) -> Array:
+    def accelerate(self, torque: Array, force: float | Array | None) -> Array:
         self._right[: self.nv] = self._generalized_forces(torque, force) - self._bias
         solved = np.array(np.linalg.solve(self._matrix, self._right), dtype=np.float64)
         self._wrenches = solved[self.nv :].reshape(-1, 6)
@@ -231,13 +241,12 @@ class PinocchioBody(Body):
         # accuracy, regularization, and iterations, which remove the error of the regularization
         self._proximal = pin.ProximalSettings(1e-14, 1e-12, 5)
 
-    def update(self, q: Array, v: Array) -> float:
+    def update(self, q: Array, v: Array) -> None:
+        super().update(q, v)
         pin.forwardKinematics(self.model, self.data, q, v)
         pin.computeJointJacobians(self.model, self.data)
-        self._update_contact(q, v)
-        return float(self.normal_jacobian[0] @ v)
 
-    def accelerate(self, torque: Array, force: float | Array) -> Array:
+    def accelerate(self, torque: Array, force: float | Array | None) -> Array:
         tau, model = self._generalized_forces(torque, force), self.model
         if not self.frames:
             return np.array(pin.aba(model, self._dynamics, *self._state, tau))

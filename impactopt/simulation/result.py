@@ -374,6 +374,14 @@ class Simulation:
         return {name: given.get(name) for name in REPORT}
 
 
+_NEXT, _PREVIOUS = [1, 2, 0], [2, 0, 1]  # axes
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Products a x b (..., 3); np.cross takes several times as long."""
+    return a[..., _NEXT] * b[..., _PREVIOUS] - a[..., _PREVIOUS] * b[..., _NEXT]
+
+
 def centre_of_pressure(wrench: Array) -> Array:
     """Centre of pressure (..., 2) [m] on the ground of wrenches (..., 6) about the origin; nan at no load."""
     # moment about the origin over normal force: (-M_y, M_x) / F_z on the plane z = 0
@@ -451,8 +459,18 @@ class Touches:
         self.touching = self.touched = False
         self._parts: list[tuple[Array, Array]] = []
 
-    def add(self, times: Array, force: Array, given: Array) -> None:
-        """Records a step: contact force (k,) [N], and impulse (k,) [N s] in the step, at times (k,) [s]."""
+    def add(self, t: float, push: Any) -> None:
+        """Records a step that begins at a time [s].
+
+        push : :class:`impactopt.simulation.target_dynamics.Push` of the step; None: no contact is near.
+        """
+        if push is None and not self.touching:  # most steps
+            self.touched = False
+            return
+        none = np.zeros(1)
+        times, force, given = (
+            (t + none, none, none) if push is None else (t + push.times, push.total, push.given)
+        )
         on = force > 0
         self.touched = self.touching or bool(on.any())
         if not self.touched:

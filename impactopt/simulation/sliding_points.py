@@ -24,10 +24,10 @@ class SlidingPoints:
     def __init__(self, friction: ContactFriction) -> None:
         self.friction, self.bristles = friction, friction.bristles
         self._normal, self._v = np.zeros(3), np.zeros(0)
-        self._jacobians: Sequence[Array] = ()
+        self._jacobians: Sequence[Array] | Array = ()
         self.surface, self._ways = np.zeros(3), np.zeros((0, 3))
 
-    def update(self, normal: Array, jacobians: Sequence[Array], v: Array) -> None:
+    def update(self, normal: Array, jacobians: Sequence[Array] | Array, v: Array) -> None:
         """Sets the normal (3,), the points' Jacobians (3, nv) and v (nv,)."""
         self._normal, self._jacobians, self._v = normal, jacobians, v
 

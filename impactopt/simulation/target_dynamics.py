@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
 
@@ -28,7 +28,7 @@ MAX_POINTS = 20_000  # of the integration within one step; a contact that needs 
 
 @dataclass(frozen=True)
 class Push:
-    """Contact forces and target motion within one step of an engine.
+    """Contact forces and target motion within one step of an engine in which a contact is near.
 
     forces (h,) [N] : of each striker, mean over the step
     first_half (h,) [N] : mean over the first half of the step
@@ -46,9 +46,9 @@ class Push:
     state: Array
     travel: float
     depths: Array
-    times: Array = field(default_factory=lambda: np.zeros(1))
-    total: Array = field(default_factory=lambda: np.zeros(1))
-    given: Array = field(default_factory=lambda: np.zeros(1))
+    times: Array
+    total: Array
+    given: Array
 
 
 class TargetContact:

@@ -19,7 +19,7 @@ from impactopt import InputError, Perturbation, Robot
 from impactopt.files.problem_file import read_problem_file
 from impactopt.simulation import ControllerSettings, Scene, Simulation, collision_geometry, simulate_mujoco
 from impactopt.simulation.collision_geometry import Solid, Solids
-from impactopt.simulation.controller import controller_of
+from impactopt.simulation.controller import clearance, controller_of
 from impactopt.simulation.controller.clearance import Clearance
 from impactopt.simulation.controller.sensors import Sensors, StateEstimate
 from impactopt.simulation.controller.tracking_reference import Recovery, TrackingReference
@@ -425,3 +425,59 @@ def test_a_link_that_turns_and_an_obstacle_brake_by_their_distances_second_rate(
     # what the accelerations have beyond what is asked for, is what the second rate has
     beyond = second + 2 * 40.0 * rate + 40.0**2 * (now - 0.002)
     assert float(rows[0] @ a - least[0]) == pytest.approx(beyond, abs=1e-4)
+
+
+def cubes_on_joints(robot: Robot) -> Solids:
+    """A cube of 6 cm on each joint of a robot, and all pairs of those that no joint connects."""
+    model, joints = robot.model, range(1, robot.model.njoints)
+    cube = 0.03 * np.array(list(itertools.product((-1, 1), repeat=3)), dtype=float)
+    pairs = [(a - 1, b - 1) for a, b in itertools.combinations(joints, 2) if model.parents[b] != a]
+    return Solids(
+        solids=tuple(Solid(name=str(j), joint=j, vertices=cube) for j in joints), pairs=tuple(pairs)
+    )
+
+
+def moved_data(robot: Robot, q: Array, v: Array) -> Any:
+    """Pinocchio's data in a state, as `Clearance.constraints` needs them."""
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, q, v, np.zeros(robot.nv))
+    pin.computeJointJacobians(robot.model, data)
+    return data
+
+
+def test_distances_known_from_before_leave_no_constraint_out() -> None:
+    """All distances are computed for who begins, and those that matter for who has followed the motion."""
+    robot = biped()
+    solids, rng = cubes_on_joints(robot), np.random.default_rng(0)
+    q, v, followed = np.asarray(still(robot)[0].q[0]), np.zeros(robot.nv), 0
+    follows = Clearance(robot.model, solids, period=1e-3)
+    for k in range(150):
+        v = v + 0.05 * rng.standard_normal(robot.nv)
+        q = pin.integrate(robot.model, q, 1e-3 * v)
+        data = moved_data(robot, q, v)
+        found = follows.constraints(data)
+        if k % 10 == 9:
+            expected = Clearance(robot.model, solids, period=1e-3).constraints(data)
+            followed += len(expected[1])
+            for a, b in zip(found, expected, strict=True):
+                np.testing.assert_array_equal(a, b)
+    assert followed > 0
+
+
+def test_bodies_that_move_together_keep_their_distances(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = biped()
+    solids, q = cubes_on_joints(robot), np.asarray(still(robot)[0].q[0])
+    of, computed = Clearance(robot.model, solids, period=1e-3), list[int]()
+    of.constraints(moved_data(robot, q, np.zeros(robot.nv)))
+    distance = clearance.coal.distance
+
+    def counted(*given: Any) -> float:
+        computed[-1] += 1
+        return float(distance(*given))
+
+    monkeypatch.setattr(clearance.coal, "distance", counted)
+    for speed in (0.0, 5.0):  # [m/s, rad/s] of the base
+        computed.append(0)
+        v = np.r_[np.full(6, speed), np.zeros(robot.nv - 6)]
+        of.constraints(moved_data(robot, pin.integrate(robot.model, q, 1e-3 * v), v))
+    assert computed[1] == computed[0] < len(solids.pairs) / 4

@@ -10,6 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids
+from impactopt.simulation.result import cross
 
 Array = NDArray[np.float64]
 MIN_DISTANCE = 2e-3  # [m]: plans keep more, but for half a millimetre between their nodes
@@ -32,8 +33,8 @@ class Clearance:
     target are left out, because the controller does not know its position.
 
     The distance of a pair is computed only when its constraint may exceed
-    `-MAX_CLOSING_ACCELERATION`, by bounds on how far its bodies have moved since the last computation, and on
-    their speed.
+    `-MAX_CLOSING_ACCELERATION`, by bounds on how far one body has moved in the other's frame since the last
+    computation, and on its speed there.
 
     period [s] : from one call of `constraints` to the next.
     """
@@ -43,16 +44,19 @@ class Clearance:
         pairs = [p for p in solids.pairs if FLOOR not in p and not any(solids.solids[k].of_target for k in p)]
         self._pairs = np.array(pairs, dtype=np.intp).reshape(-1, 2)
         self._joints = np.array([s.joint for s in self._solids], dtype=np.intp)
-        # enclosing balls
-        self._centres, self._radii = np.zeros((len(self._solids), 3)), np.zeros(len(self._solids))
-        for k, solid in enumerate(self._solids):
-            self._centres[k], self._radii[k] = solid.ball()
         self._shapes = {int(k): _shape(self._solids[k]) for k in np.unique(self._pairs)}
-        # bounds [m] on how far each body has moved in total, and in the last period
-        self._moved, self._moved_last = np.zeros((2, len(self._solids)))
-        # of each pair: the last computed distance, and the sum of its bodies' `_moved` at that time
-        self._distance, self._moved_then = np.zeros(len(self._pairs)), np.zeros(len(self._pairs))
-        self._last: tuple[Array, Array] | None = None  # rotations of the joints and centres of the balls
+        # largest distance [m] of a body's points from its joint's origin
+        balls = [solid.ball() for solid in self._solids]
+        reach = np.array([np.linalg.norm(centre) + radius for centre, radius in balls])[self._pairs]
+        # of each pair the body with the smaller reach moves, in the frame of the other
+        joints, moving = self._joints[self._pairs], reach.argmin(axis=1)[:, None]
+        from_to = np.hstack([np.take_along_axis(joints, k, axis=1) for k in (1 - moving, moving)])
+        # pairs of joints, and the index of each pair of bodies among them
+        self._joint_pairs, self._index = np.unique(from_to, axis=0, return_inverse=True)
+        self._reach = reach.min(axis=1)
+        # of each pair of bodies: lower bound [m] on the distance, and upper bound [m] on the last motion
+        self._least_distance, self._moved = np.zeros((2, len(self._pairs)))
+        self._last: tuple[Array, Array] | None = None  # rotations and translations of the pairs of joints
         self._request = coal.DistanceRequest()
 
     def constraints(self, data: Any) -> tuple[Array, Array]:
@@ -62,16 +66,15 @@ class Clearance:
             a = 0.
         """
         origins = self._update_bounds(data)
-        least_distance = self._distance - (self._moved[self._pairs].sum(axis=1) - self._moved_then)
-        most_speed = self._moved_last[self._pairs].sum(axis=1) / self._period
         # with the least distance and the largest closing speed that these bounds permit
-        near = np.flatnonzero(_least_second_rate(least_distance, -most_speed) > -MAX_CLOSING_ACCELERATION)
+        bound = _least_second_rate(self._least_distance, -self._moved / self._period)
+        near = np.flatnonzero(bound > -MAX_CLOSING_ACCELERATION)
         if not len(near):
             return np.zeros((0, self._model.nv)), np.zeros(0)
         pairs = self._pairs[near]
         results = self._distances(data, pairs)
         distance = np.array([result.min_distance for result in results])
-        self._distance[near], self._moved_then[near] = distance, self._moved[pairs].sum(axis=1)
+        self._least_distance[near] = distance
         normals = np.array([result.normal for result in results])  # from the first body to the second
         points = np.array([(r.getNearestPoint1(), r.getNearestPoint2()) for r in results])
         joints = self._joints[pairs]
@@ -82,29 +85,35 @@ class Clearance:
         lower = _least_second_rate(distance, rate) - drift
         chosen = [k for k in np.argsort(-lower)[:MAX_CONSTRAINTS] if lower[k] > -MAX_CLOSING_ACCELERATION]
         jacobian = np.zeros((len(chosen), self._model.nv))
+        # n . (v + omega x arm) = n . v + (arm x n) . omega
+        moments = cross(arms, normals[:, None])
         for row, k in zip(jacobian, chosen, strict=True):
-            for joint, arm, sign in zip(joints[k], arms[k], (-1.0, 1.0), strict=True):
+            for joint, moment, sign in zip(joints[k].tolist(), moments[k], (-1.0, 1.0), strict=True):
                 if joint:  # joint 0 is the world
-                    J = pin.getJointJacobian(self._model, data, int(joint), _AXES)
-                    # n . (v + omega x arm) = n . v + (arm x n) . omega
-                    row += sign * (normals[k] @ J[:3] + np.cross(arm, normals[k]) @ J[3:])
+                    J = pin.getJointJacobian(self._model, data, joint, _AXES)
+                    row += sign * (normals[k] @ J[:3] + moment @ J[3:])
         return jacobian, lower[chosen]
 
     def _update_bounds(self, data: Any) -> Array:
-        """Updates the bounds on the bodies' motion, and returns the origins (joints, 3) [m] of all joints.
+        """Updates the bounds of all pairs, and returns the origins (joints, 3) [m] of all joints.
 
-        A body has moved by at most the displacement of its ball's centre and the chord of its rotation.
+        In the other's frame a body has moved by at most the displacement of its joint's origin and the chord
+        of its rotation.
         """
-        rotations = np.array([place.rotation for place in data.oMi])[self._joints]
-        origins = np.array([place.translation for place in data.oMi])
-        centres = origins[self._joints] + (rotations @ self._centres[:, :, None])[:, :, 0]
+        places = data.oMi
+        rotations = np.array([place.rotation for place in places])
+        origins = np.array([place.translation for place in places])
+        other, moving = self._joint_pairs.T
+        into = rotations[other].transpose(0, 2, 1)
+        rotation = into @ rotations[moving]
+        translation = (into @ (origins[moving] - origins[other])[:, :, None])[:, :, 0]
         if self._last is not None:
-            displacement = np.linalg.norm(centres - self._last[1], axis=1)
+            displacement = np.linalg.norm(translation - self._last[1], axis=1)
             # Frobenius norm of the difference of two rotations by an angle: sqrt(2) * 2 sin(angle / 2)
-            chord = np.linalg.norm(rotations - self._last[0], axis=(1, 2)) / np.sqrt(2.0)
-            self._moved_last = displacement + self._radii * chord
-            self._moved += self._moved_last
-        self._last = rotations, centres
+            chord = np.linalg.norm(rotation - self._last[0], axis=(1, 2)) / np.sqrt(2.0)
+            self._moved = displacement[self._index] + self._reach * chord[self._index]
+            self._least_distance -= self._moved
+        self._last = rotation, translation
         return origins
 
     def _distances(self, data: Any, pairs: NDArray[np.intp]) -> list[Any]:
@@ -130,13 +139,13 @@ def _of_points(data: Any, joints: NDArray[np.intp], arms: Array) -> tuple[Array,
 
     def world(motions: Any) -> tuple[Array, Array]:
         local = np.array([motion.vector for motion in motions]).reshape(-1, 2, 3, 1)
-        linear, angular = np.moveaxis((rotations[:, None] @ local)[..., 0], 1, 0)
-        return linear[joints], angular[joints]
+        vectors = (rotations[:, None] @ local)[joints, ..., 0]
+        return vectors[:, :, 0], vectors[:, :, 1]
 
     (linear, angular), (spatial, angular_acceleration) = world(data.v), world(data.a)
-    velocity = linear + np.cross(angular, arms)
+    velocity = linear + cross(angular, arms)
     # classical acceleration of a point from the joint's spatial one: omega x velocity is added
-    acceleration = spatial + np.cross(angular_acceleration, arms) + np.cross(angular, velocity)
+    acceleration = spatial + cross(angular_acceleration, arms) + cross(angular, velocity)
     return velocity, acceleration
 
 

@@ -95,7 +95,6 @@ class TorqueResponse(DenseBody):
 
     A (nv, n), a0 (nv,) : accelerations A tau + a0
     B (6 frames, n), b0 : wrenches of the ground on the frames at their origins, world axes
-    striking_jacobians (h, 3, nv) : of the striking points' velocities
     striking_drift (h, 3) [m/s^2] : their accelerations for a = 0
     stabilizing_wrenches : part of b0 that returns the soles to their initial height and tilt
     impulse_response (nv, h) : change of v by a unit impulse against the normal at each striking point
@@ -119,14 +118,16 @@ class TorqueResponse(DenseBody):
         pin.framesForwardKinematics(self.model, self.data, q0)
         self._initial = self.placements()[: len(soles)]  # a grip needs no stabilization
 
-    def update(self, q: Array, v: Array, forces: Array | float = 0.0, bandwidth: float = 0.0) -> float:
+    def update(self, q: Array, v: Array, forces: Array | float = 0.0, bandwidth: float = 0.0) -> None:
         """Evaluates the dynamics at q (nq,), v (nv,).
 
         forces : (h,) [N] on the striking points, against the normal.
         bandwidth : [rad/s] of the stabilization of the soles (Baumgarte's, in height, roll and pitch).
         """
-        speed, nv, n, right = super().update(q, v), self.nv, self.n, self._columns
-        right[:nv, n] = self._generalized_forces(np.zeros(n), np.zeros(len(self.strikers))) - self._bias
+        super().update(q, v)
+        self.update_contact()
+        nv, n, right = self.nv, self.n, self._columns
+        right[:nv, n] = self._generalized_forces(np.zeros(n), None) - self._bias
         right[nv:, n] = self._right[nv:]
         for k, (now, initial) in enumerate(zip(self.placements(), self._initial, strict=False)):
             rows = slice(nv + 6 * k, nv + 6 * k + 6)
@@ -134,7 +135,6 @@ class TorqueResponse(DenseBody):
             error = np.zeros(6)  # horizontal position and yaw stay zero: a sole that slid is not pulled back
             error[2], error[3:5] = now.translation[2] - initial.translation[2], rotation_error[:2]
             right[rows, n + 1] = -(bandwidth**2) * error - 2 * bandwidth * (self._matrix[rows, :nv] @ v)
-        self.striking_jacobians = np.array([self._jacobian(i)[:3] for i in self.strikers])
         drifts = [pin.getFrameClassicalAcceleration(self.model, self.data, i, _AXES) for i in self.strikers]
         self.striking_drift = np.array([drift.linear for drift in drifts])
         right[:nv, n + 2 :] = -self.normal_jacobian.T
@@ -145,7 +145,6 @@ class TorqueResponse(DenseBody):
         self.impulse_response = solved[:nv, n + 2 :]
         self.B, self.b0 = solved[nv:, :n], constant[nv:]
         self.stabilizing_wrenches = solved[nv:, n + 1]
-        return speed
 
     def fix_torques(self, which: NDArray[np.bool_], torque: Array) -> None:
         """Moves the torques (n,) [N m] of some joints, as of springs, from the unknowns to a0 and b0."""
@@ -397,7 +396,7 @@ class WholeBodyController:
         if s.projects and self.tracking.near_impact(t, PROJECTION_WINDOW):
             # remove the part of the error that an impulse at the striking points can explain (Yang and
             # Posa 2021): an impact that comes early or late makes just such an error
-            J = self.scene.normal @ dynamics.striking_jacobians
+            J = dynamics.normal_jacobian
             response = dynamics.impulse_response
             v_error = v_error - response @ dgesv(J @ response, J @ v_error)[2]
         A, B = dynamics.A * self.limit, dynamics.B * self.limit  # of x
@@ -454,7 +453,7 @@ class WholeBodyController:
         if not (self.tracking.before_contact or draws_back):
             return
         for J, point, drift, goal in zip(
-            dynamics.striking_jacobians,
+            dynamics.jacobians,
             dynamics.striking_points(),
             dynamics.striking_drift,
             aim.striking_points,

@@ -331,7 +331,9 @@ class Motion:
         self._evaluations = self._evaluations + 1
         nv, n = self._nv, self._n
         u, v = y[:nv], y[nv : 2 * nv]
-        speed = self.body.update(pin.integrate(self.body.model, self._q, u), v)
+        self.body.update(pin.integrate(self.body.model, self._q, u), v)
+        self.body.update_contact()
+        speed = float(self.body.speeds()[0])
         rate = speed - self.forces.target_speed(y[self.target_part])
         return _State(time, y, speed, rate, self.forces.demand(time, u[-n:], v[-n:]))
 

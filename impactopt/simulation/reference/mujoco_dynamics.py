@@ -73,7 +73,9 @@ class MujocoDynamics(ReferenceModel):
         self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float
     ) -> tuple[Collision, float]:
         body = DenseBody(*self._body_arguments, normal, self.contact_friction)
-        rate = body.update(q, v) - forces.target_speed(np.zeros(forces.target.n_states))
+        body.update(q, v)
+        body.update_contact()
+        rate = float(body.speeds()[0]) - forces.target_speed(np.zeros(forces.target.n_states))
         scales = contact_scales(body, forces, rate, self.horizon)
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
         fastest = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
@@ -189,6 +191,7 @@ def march(
     while True:
         world.mujoco.mj_step1(world.world, data)  # up to velocities; forces are set before mj_step2
         speed = float(world.speeds_along(normal)[0])
+        world.update_friction(normal)
         if k == 0:
             start = float(normal @ world.striking_points()[0])
         if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):
@@ -216,8 +219,9 @@ def march(
         ends = (not phase.touching and (k > 0 or rate != 0)) or time >= horizon * (1 - 1e-9)
         if ends:
             end, tangential = world.state(), world.tangential[1]
-        world.bend(np.array([force]), step)
-        world.apply(torque - forces.friction(velocity, phase), force)
+        on_hand = np.array([force])
+        world.bend(on_hand, step)
+        world.apply(torque - forces.friction(velocity, phase), on_hand)
         world.mujoco.mj_step2(world.world, data)
         peak = max(peak, force)
         if ends or k % every == 0:

@@ -18,6 +18,7 @@ _MAX_WIDTH = 1.0  # of the interval of a determined parameter, over its value
 _DIGITS = 5  # of parameters in a file
 _MAX_CORRELATION = 4.0  # of white noise, in standard deviations
 _INTERPOLATION_ERROR = 0.05  # [% of the peak] residual of a log without noise
+_LIGHT = 0.05  # [kg] no robot's effective mass is less
 _TIE = 10.0  # difference of AIC below which a log cannot distinguish laws
 
 
@@ -200,6 +201,8 @@ class Identification:
         if best.undetermined:
             out.append(f"the log does not determine {', '.join(best.undetermined)} of {best.name}")
         mass = best.effective_mass
+        if mass.high < _LIGHT:
+            out.append(f"the effective mass is {mass.value:.2g} kg, hardly a robot's: is force_N in kN?")
         known = [x for x in self.model_mass if np.isfinite(x)]
         if known and not mass.low <= float(np.mean(known)) <= mass.high:
             out.append(

@@ -118,6 +118,13 @@ def test_what_a_log_does_not_determine_is_said() -> None:
     assert "not determined" in found.best.toml()
 
 
+def test_a_force_in_kilonewtons_is_told() -> None:
+    log = log_of(TrueBlow("spring damper"))
+    found = identify(dataclasses.replace(log, force=log.force / 1e3), laws=[SpringDamper])
+    assert any("is force_N in kN?" in caution for caution in found.cautions)
+    assert not any("kN" in caution for caution in identify(log, laws=[SpringDamper]).cautions)
+
+
 def test_a_law_that_does_not_fit_is_told() -> None:
     found = identify(log_of(TrueBlow("Hunt-Crossley")), laws=[SpringDamper])
     assert any("not white noise" in caution for caution in found.cautions)

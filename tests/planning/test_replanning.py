@@ -103,6 +103,13 @@ def test_a_bent_plan_is_that_of_the_changed_problem(arm: Solution, changes: dict
     assert first.result.iterations <= 5 and "first-order" in first.result.message
 
 
+def test_a_refined_plan_has_the_loads_of_a_solved_one(arm: Solution) -> None:
+    """Between the collocation points a gear load is larger than at them."""
+    bent = arm.moved(mass=0.06, refine=True)
+    again = solve(bent.problem, start=bent)
+    assert np.nanmax(bent.loads.gear) == pytest.approx(np.nanmax(again.loads.gear), rel=1e-3)
+
+
 @pytest.mark.parametrize("failing", [0, 1])
 def test_where_one_start_leads_nowhere_the_next_does(
     arm: Solution, failing: int, monkeypatch: pytest.MonkeyPatch

@@ -21,7 +21,7 @@ from impactopt.kinematics.support import margin
 from impactopt.simulation import Scene, Simulation, simulate, simulate_mujoco, simulate_pinocchio
 from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.mujoco_engine import _Replay
-from impactopt.simulation.mujoco_world import MujocoOptions
+from impactopt.simulation.mujoco_world import MujocoOptions, build_world
 
 Array = NDArray[np.float64]
 
@@ -150,6 +150,19 @@ def test_a_state_goes_to_mujoco_and_back(name: str, worlds: dict[str, _Replay], 
         for corner in its
     ]
     np.testing.assert_allclose(replay.corner_places(), np.reshape(corners, (-1, 3)), atol=1e-9)
+
+
+def test_balls_about_links_touch_their_hulls_and_leave_nothing_out() -> None:
+    """MuJoCo looks for contacts inside them only; its own enclose a long hull's box, and are larger."""
+    robot, draw = biped(), np.random.default_rng(0)
+    hulls = [draw.standard_normal((20, 3)) * [0.05, 0.05, scale] for scale in (0.05, 0.5)]
+    solids = tuple(Solid(name=str(k), joint=k + 2, vertices=hull) for k, hull in enumerate(hulls))
+    there = replace(scene("striker:fist"), solids=Solids(solids=solids, pairs=((0, 1),)))
+    world = build_world(robot, there, Perturbation(), MujocoOptions(), [(0, 1)])
+    for k, hull in enumerate(hulls):
+        geom = world.geom(f"solid {k}")
+        farthest = np.linalg.norm(hull - geom.pos, axis=1).max()
+        assert geom.rbound[0] == pytest.approx(farthest, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["biped", "arm", "talos"])

@@ -28,7 +28,7 @@ def check(
     with plain_errors("interrupted", verbose=verbose, as_json=as_json):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.feasibility import hopeless, sticks_out, too_weak, unusual
+        from impactopt.problem.feasibility import blocked, hopeless, sticks_out, too_weak, unusual
         from impactopt.problem.plausibility import doubts
 
         try:
@@ -36,7 +36,13 @@ def check(
             found = Mistakes()
             found.found += hopeless(problem)
             found.raise_if_any(str(file))
-            told = too_weak(problem), *unusual(problem), *sticks_out(problem), *doubts(problem.robot)
+            told = (
+                blocked(problem),
+                too_weak(problem),
+                *unusual(problem),
+                *sticks_out(problem),
+                *doubts(problem.robot),
+            )
             warnings = [text for text in told if text]
         except InputError as error:
             if not as_json:

@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.errors import MOST, InputError, check_number
+from impactopt.errors import MOST, InputError, check_number, counted
 
 _METADATA = "about"
 
@@ -208,13 +208,14 @@ def expressions_of(
             f"{where}: cannot be called with CasADi expressions as {call}, with casadi.fmax and "
             f"casadi.if_else in the place of max and if: {error}"
         ) from error
-    wanted = "one expression" if names is None else f"a list of {len(names)}: {', '.join(map(str, names))}"
+    wanted = "one expression" if names is None else f"a list of {len(names)}"
+    wanted += f": {', '.join(map(str, names))}" if names else ""
     if not right:
         kind = "nothing" if given is None else "a list" if listed else "no list"
         raise InputError(f"{where}: {call} gives {kind}; give {wanted}")
     count = sum(part.numel() for part in found)
     if count != (1 if names is None else len(names)) or len(found) != count:
-        raise InputError(f"{where}: {call} gives {count} expressions; give {wanted}")
+        raise InputError(f"{where}: {call} gives {counted(count, 'expression')}; give {wanted}")
     return found
 
 
@@ -226,8 +227,9 @@ def check_parameters_taken(instance: Any, expressions: Iterable[Any]) -> None:
     used = {symbol.name() for symbol in ca.symvar(ca.SX(ca.veccat(*expressions)))}
     if missing := [name for name in numbers_of(instance) if name not in used or f"self.{name}" in used]:
         raise InputError(
-            f"{type(instance).__name__} does not take {', '.join(missing)} from the argument `parameters` of "
-            'its methods, so changing it would do nothing: write parameters["..."], not self'
+            f"{type(instance).__name__}: expressions of its methods do not have {', '.join(missing)} from "
+            "their argument `parameters`, so that a compiled function would not get a changed number: write "
+            'parameters["..."], not self, and give no field that is in none of them'
         )
 
 

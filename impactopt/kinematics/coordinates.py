@@ -562,9 +562,10 @@ class StanceCoordinates:
 
     @cached_property
     def _unlimited(self) -> NDArray[np.bool_]:
-        """Mask of the base's roll and yaw and of continuous joints among all coordinates."""
+        """Mask of the base's roll and yaw and of continuous joints without limits among all coordinates."""
         base = np.isin(np.arange(self.base), (3, 5))
-        return np.append(base, [self.model.joints[j].nq == 2 for j in joint_indices(self.model)])
+        continuous = [self.model.joints[j].nq == 2 for j in joint_indices(self.model)]
+        return np.append(base, continuous & np.isinf(self.robot.lower) & np.isinf(self.robot.upper))
 
     def join(self, y: Array, legs: Array) -> Array:
         """Pinocchio configuration (nq,) of y (ny,) and legs (nl,), or (k, nq) of k of them."""

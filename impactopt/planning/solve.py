@@ -42,7 +42,7 @@ from impactopt.planning.multistart import (
 from impactopt.planning.refinement import Guess, Oracle, Outcome, refine
 from impactopt.planning.solution import Solution, program_of, program_on, solution_of
 from impactopt.planning.strike import clear_strike
-from impactopt.problem.feasibility import hopeless
+from impactopt.problem.feasibility import blocked, hopeless
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import strongest_posture
@@ -178,7 +178,7 @@ def _planned(
         outcome = solver.on(outcome)
     # Reasons that need no search come first.
     failed = ended_with_violations(outcome.program, outcome.result)
-    known = (hopeless(t.problem) or doubts) if failed else []
+    known = (hopeless(t.problem) or doubts or list(filter(None, [blocked(t.problem)]))) if failed else []
     outcome, causes = (outcome, ()) if known else _diagnosed(outcome, solver)
     gains = chosen_gains(outcome.program, outcome.result.x)
     # Before the replay, which needs a robot with gains of its own.

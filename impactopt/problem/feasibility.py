@@ -33,19 +33,16 @@ PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers in a problem f
 LONG = 10.0  # [s] of a phase: longer ones are hard to believe
 HEAVY = 20.0  # mass of a target over the robot's, likewise
 DRAWN_POSTURES = 3  # initial guesses of inverse kinematics, beside the postures at start and at contact
-# random postures at the hit point: number, and standard deviation [rad] of their initial guesses
-DRAWN_AT_HIT, AT_HIT_SPREAD = 15, 1.0
+# initial guesses of random postures at the hit point, and postures found from which it may count as blocked
+DRAWN_AT_HIT, LEAST_AT_HIT = 24, 4
 BLOCKED_DEPTH = 0.01  # [m] of penetration in all postures at the hit point, above which it counts as blocked
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """Reasons why no solve can succeed: implausibly large soles; else a start beyond the target, a hit point
-    that no balanced posture reaches, and one where bodies penetrate in all postures that reach it.
+    """Reasons why no solve can succeed: implausibly large soles; else a start beyond the target, and a hit
+    point that no balanced posture reaches.
     """
-    found = list(giant_soles(problem.robot)) or [
-        _beyond(problem),
-        _out_of_balance(problem) or _blocked(problem),
-    ]
+    found = list(giant_soles(problem.robot)) or [_beyond(problem), _out_of_balance(problem)]
     return [text for text in found if text]
 
 
@@ -162,8 +159,11 @@ def _nearest(problem: ImpactProblem, polygon: Array) -> Reach:
     return best
 
 
-def _blocked(problem: ImpactProblem) -> str:
-    """Message about a hit point where two bodies penetrate deeply in all postures that are found; else ""."""
+def blocked(problem: ImpactProblem) -> str:
+    """Message about a hit point where bodies penetrate deeply in all of several postures found; else "".
+
+    There may be others, so that a motion may be found all the same.
+    """
     if problem.second is not None or not (problem.keep_out.enabled and problem.self_collision.enabled):
         return ""
     try:
@@ -177,6 +177,8 @@ def _blocked(problem: ImpactProblem) -> str:
         if not touches or touches[0].depth < BLOCKED_DEPTH:
             return ""
         found.append(touches[0])
+    if len(found) < LEAST_AT_HIT:
+        return ""
     best = min(found, key=lambda touch: touch.depth)
     return (
         f"in each of {len(found)} postures found at the hit point two bodies penetrate each other, in the "
@@ -187,10 +189,15 @@ def _blocked(problem: ImpactProblem) -> str:
 
 def _postures_at_hit(problem: ImpactProblem) -> Iterator[Array]:
     """Configurations (nq,) with the striking point at the hit point: that of the problem, and random ones."""
-    robot, rng = problem.robot, np.random.default_rng(0)
-    yield problem.contact_posture
+    robot, posture, rng = problem.robot, problem.contact_posture, np.random.default_rng(0)
+    yield posture
+    limb = np.array(robot.limb(robot.striker(problem.striker).model_frame), dtype=np.intp)
+    # drawn in all of the joints' ranges, as an arm reaches a point in several ways
+    lower, upper = (np.where(np.isfinite(x), x, y) for x, y in ((robot.lower, -np.pi), (robot.upper, np.pi)))
     for _ in range(DRAWN_AT_HIT):
-        step = np.concatenate([np.zeros(robot.nv - robot.n), AT_HIT_SPREAD * rng.standard_normal(robot.n)])
-        guess = pin.integrate(robot.model, problem.contact_posture, step)
+        step: Array = np.zeros(robot.nv)
+        drawn = rng.uniform(lower[limb], upper[limb])
+        step[robot.nv - robot.n + limb] = drawn - robot.joint_positions(posture)[limb]
+        guess = pin.integrate(robot.model, posture, step)
         with contextlib.suppress(InputError):
             yield inverse_kinematics(problem.coordinates, problem.striker, problem.point, guess, starts=1)

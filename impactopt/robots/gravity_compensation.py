@@ -65,10 +65,13 @@ def compensation(model: pin.Model, gravity: Array, bodies: Sequence[CompensatedB
         weight = abs(body.fraction - fraction) * body.mass * float(np.linalg.norm(gravity))
         lever, below = float(np.linalg.norm(body.centre)), body.joint
         while below:  # from the body to the root, with the links stretched out
-            slides = "JointModelP" in model.joints[below].shortname()
-            name = str(model.names[below])
+            joint, name = model.joints[below], str(model.names[below])
+            slides = "JointModelP" in joint.shortname()
             if lifts[below]:
                 loads[name] = loads.get(name, 0.0) + weight * (1.0 if slides else lever)
+            if slides:
+                low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+                lever += float(max(abs(low), abs(high)))
             lever += float(np.linalg.norm(model.jointPlacements[below].translation))
             below = int(model.parents[below])
     return Compensation(fraction=fraction, others=tuple(body.name for body in others), loads=loads)

@@ -97,14 +97,17 @@ def notes_of(c: Compiled, torque: Mapping[str, float]) -> Iterator[str]:
     mj = c.mj
     found = _gravcomp(c)
     if found is not None and found.fraction:
-        carried = f"motors carry {1 - found.fraction:g} times the weight, as in MuJoCo"
-        yield f"{'most' if found.others else 'all'} bodies have gravcomp {found.fraction:g}: {carried}"
+        which = (
+            f"{'most' if found.others else 'all'} bodies that joints lift have gravcomp {found.fraction:g}"
+        )
+        yield f"{which}: motors carry {1 - found.fraction:g} times the weight, as in MuJoCo"
     shares = {} if found is None else found.negligible(torque)
     if found is not None and shares:
         joint = max(shares, key=lambda joint: shares[joint])
         yield (
             f"the gravcomp of {', '.join(map(repr, found.others))} is not that of the rest, and is left out: "
-            f"at most {found.loads[joint]:.2g} N m of {joint!r}, {100 * shares[joint]:.2g} % of its limit"
+            f"at most {found.loads[joint]:.2g} N m of {joint!r}, {100 * shares[joint]:.2g} % of the "
+            "file's limit"
         )
     if mj.opt.density > 0 or mj.opt.viscosity > 0:
         yield "fluid drag is left out: <option density, viscosity>"

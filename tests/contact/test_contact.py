@@ -539,9 +539,13 @@ def test_a_law_is_refused_when_it_is_made(branch, message):
 
 
 def test_a_law_that_does_not_take_its_numbers_as_inputs_is_refused():
-    with pytest.raises(InputError, match=r"Baked does not take stiffness .* `parameters`"):
+    with pytest.raises(
+        InputError, match=r"Baked: expressions of its methods do not have stiffness .* `parameters`"
+    ):
         Baked(stiffness=1e4)
-    with pytest.raises(InputError, match=r"HalfBaked does not take stiffness .* `parameters`"):
+    with pytest.raises(
+        InputError, match=r"HalfBaked: expressions of its methods do not have stiffness .* `parameters`"
+    ):
         HalfBaked(stiffness=1e4)
     with pytest.raises(InputError, match=r"separation\(.*\) gives 2 expressions; give one expression"):
         Parting(stiffness=1e4, dissipation=0.0)

@@ -184,8 +184,10 @@ class Sprung(Target):
         ({"velocity": lambda t, z, p=None: ca.vertcat(*z)}, "velocity.* gives 2 expressions; give one"),
         ({"energy": lambda t, z, p=None: None}, "energy.* gives nothing; give one expression"),
         ({"energy": lambda t, z, p=None: max(z[0], 0.0)}, "as energy.*casadi.fmax"),
-        ({"energy": lambda t, z, p=None: t.mass * z[0] ** 2}, "does not take mass from .*`parameters`"),
+        ({"energy": lambda t, z, p=None: t.mass * z[0] ** 2}, "do not have mass from .*`parameters`"),
         ({"typical": (1.0,)}, "typical has 1 numbers"),
+        ({"switches": lambda t, z, f, p=None: f}, "switches.* cannot be called"),
+        ({"tangential_mass": lambda t, p=None: max(p["mass"], 1.0)}, "tangential_mass.*casadi.fmax"),
     ],
 )
 def test_a_target_whose_methods_give_what_they_should_not_is_refused_when_it_is_made(changes, message):

@@ -767,6 +767,15 @@ def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
     (tmp_path / "robot.urdf").write_text(text.replace("</robot>", f"{''.join(links)}{steer}{roll}</robot>"))
     locked = draft_robot(tmp_path / "robot.urdf").locked
     assert {joint for joint, why in locked.items() if why == "drives a base"} == {"steer", "roll"}
+    plane = [
+        urdfs.joint("x", "base", "sliding", "1 0 0", (0, 0, 0.2), far, kind="prismatic"),
+        urdfs.joint("y", "sliding", "turning", "0 1 0", (0, 0, 0), far, kind="prismatic"),
+        urdfs.joint("yaw", "turning", "mobile", "0 0 1", (0, 0, 0), far),
+    ]
+    links.append(urdfs.link("sliding", 4.0, (0.1, 0.1, 0.1), (0, 0, 0)))
+    (tmp_path / "robot.urdf").write_text(text.replace("</robot>", f"{''.join(links + plane)}</robot>"))
+    locked = draft_robot(tmp_path / "robot.urdf").locked
+    assert {joint for joint, why in locked.items() if why == "drives a base"} == {"x", "y", "yaw"}
 
 
 def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
@@ -807,6 +816,22 @@ def test_an_mjcf_with_weightless_fingers_is_bolted(tmp_path: Path) -> None:
     """)
     drafted = draft_robot(path, mjcf=True)
     assert not drafted.robot.floating and set(drafted.locked) == {"claw"}
+
+
+def test_legs_with_a_weightless_finger_are_not_bolted_silently(tmp_path: Path) -> None:
+    """The equations of motion of a robot that floats have no gravity of a finger's own."""
+    mujoco = pytest.importorskip("mujoco")
+    compiler = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
+    read = mujoco.MjModel.from_xml_string(re.sub(r"(<robot[^>]*>)", rf"\1{compiler}", urdfs.biped(), count=1))
+    path = tmp_path / "biped.xml"
+    mujoco.mj_saveLastXML(str(path), read)
+    finger = """<body name="finger" pos="0 0 -0.25" gravcomp="1">
+        <joint name="claw" type="slide" range="0 .03"/>
+        <inertial pos="0 0 0" mass="0.02" diaginertia="1e-5 1e-5 1e-5"/></body>"""
+    elbow = r'(<body name="right_elbow_link"[^>]*>)'
+    path.write_text(re.sub(elbow, rf"\1{finger}", path.read_text(), count=1))
+    with pytest.raises(InputError, match=r"gravcomp of 'finger' .* stands on legs; give all of them"):
+        draft_robot(path, mjcf=True)
 
 
 def test_a_joint_may_have_a_links_name(tmp_path: Path) -> None:

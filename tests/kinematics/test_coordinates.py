@@ -166,6 +166,12 @@ def test_a_base_that_faces_backwards_does_not_turn_round() -> None:
         np.testing.assert_allclose(step[3:6], 0.03 * turn, atol=1e-9)
 
 
+def test_a_continuous_joint_with_limits_stays_inside_them() -> None:
+    robot = arm(position_limit=dict.fromkeys(("turn", "shoulder", "elbow", "wrist"), (-3.0, 3.0)))
+    near, far = (robot.angles.put(np.zeros(robot.nq), np.array([x, 0.3, 0.3, 0.3])) for x in (2.9, -2.9))
+    assert StanceCoordinates(robot, (), near).split(far)[0][0] == pytest.approx(-2.9)
+
+
 # ---- fixed soles
 
 

@@ -31,8 +31,9 @@ from impactopt import (
 from impactopt.cli.app import app
 from impactopt.files.draft.drafting import draft_problem
 from impactopt.kinematics.support import margin, support_polygon
-from impactopt.problem.feasibility import hopeless, sticks_out, unusual
+from impactopt.problem.feasibility import blocked, hopeless, sticks_out, unusual
 from impactopt.problem.plausibility import doubts
+from impactopt.problem.strength import touches
 
 LAW, BALL = SpringDamper(stiffness=1e4, damping=100.0), FreeMass(mass=1.0)
 
@@ -87,12 +88,21 @@ def test_a_hit_point_inside_an_obstacle_is_told_before_a_stiffness() -> None:
     problem = load_problem("arm_planar")
     below, above = ([*problem.point[:2], problem.point[2] + dz] for dz in (-0.3, 0.05))
     shelf = Obstacle(name="shelf", size=(0.3, 0.3, 0.1), position=tuple(below))
-    assert hopeless(dataclasses.replace(problem, obstacles=(shelf,))) == []
-    blocked = dataclasses.replace(problem, obstacles=(dataclasses.replace(shelf, position=tuple(above)),))
-    (said,) = hopeless(blocked)
+    assert blocked(dataclasses.replace(problem, obstacles=(shelf,))) == ""
+    inside = dataclasses.replace(problem, obstacles=(dataclasses.replace(shelf, position=tuple(above)),))
+    said = blocked(inside)
     assert "'shelf' by " in said
     with pytest.warns(NotSolvedWarning, match="Infeasible: " + re.escape(said)):
-        solve(blocked, options={"max_iterations": 10})
+        solve(inside, options={"max_iterations": 10})
+
+
+def test_an_obstacle_is_not_in_the_way_of_an_arm_that_reaches_round_it() -> None:
+    """With the elbow up the arm is in the box, with the elbow down it is clear, and the plan is solved."""
+    box = Obstacle(name="box", size=(0.076, 0.044, 0.068), position=(0.265, 0.026, 0.395))
+    problem = load_problem("arm_planar")
+    up = dataclasses.replace(problem, start=np.array([0.6, -1.7, -0.47]), terms=(), obstacles=(box,))
+    assert touches(up, up.contact_posture)
+    assert blocked(up) == "" and hopeless(up) == []
 
 
 def test_a_fixed_base_is_not_asked_for_balance() -> None:

@@ -26,6 +26,8 @@ from impactopt.errors import InputError
 
 UNITS = {"speed": "m_s", "depth": "m"}  # units of targets' results
 
+_OTHER_METHODS = ("switches", "tangential_mass", "speed_before", "smooth", "guard", "invariant", "reserve")
+
 
 class Target(Described, ABC):
     """A body that is hit and moves along the contact normal. Before contact its speed is constant.
@@ -86,7 +88,16 @@ class Target(Described, ABC):
                 f"{name}: typical has {len(self.typical)} numbers; give {self.n_states}, one for each of the "
                 "state"
             )
-        check_parameters_taken(self, [x for part in target._expressions().values() for x in part])
+        try:
+            every = [x for part in target._expressions().values() for x in part]
+            ca.veccat(*every)
+        except Exception as error:
+            raise InputError(
+                f"{name}: {', '.join(_OTHER_METHODS[:-1])} or {_OTHER_METHODS[-1]} cannot be called with "
+                "CasADi expressions, with casadi.fmax and casadi.if_else in the place of max and if, or "
+                f"gives something else than `Target` says: {error}"
+            ) from error
+        check_parameters_taken(self, every)
 
     @property
     def turns(self) -> bool:

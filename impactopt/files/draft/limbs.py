@@ -26,7 +26,9 @@ FINGER_MASS, FINGER_LENGTH = 0.03, 0.25
 # Fractions of the robot's height: largest height of a foot's lowest point above the lowest of all, and least
 # height of the root link's.
 FOOT_HEIGHT, ROOT_HEIGHT = 0.05, 0.1
-TRAVEL = 20.0  # [m] of a prismatic joint: a longer one drives a mobile base
+# ranges [m] of a prismatic, and [rad] of a revolute joint: larger ones drive a mobile base, the latter if it
+# is on the former
+TRAVEL, TURN = 20.0, 4 * np.pi
 TOE = 0.03  # [m] from an ankle to a toe's joint, at least; half of it: largest height of foot over toe
 
 
@@ -59,6 +61,14 @@ def limbs_of(model: pin.Model) -> tuple[Limb, ...]:
     return tuple(out)
 
 
+def _range(model: pin.Model, j: int) -> tuple[float, float]:
+    """Range [rad], [m] of a joint; infinite of those that have none, such as continuous ones."""
+    k = model.joints[j].idx_q
+    if model.joints[j].nq != 1:
+        return -np.inf, np.inf
+    return float(model.lowerPositionLimit[k]), float(model.upperPositionLimit[k])
+
+
 def to_lock(model: pin.Model) -> dict[str, str]:
     """Joints that a plan should not move, with reasons: fingers, wheels, joints without range or mass,
     prismatic joints too weak for their load, drives of a mobile base.
@@ -70,12 +80,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
     effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
     weight = np.abs(pin.computeGeneralizedGravity(model, model.createData(), neutral(model)))
     for j in range(model.njoints - 1, first - 1, -1):
-        joint, name = model.joints[j], str(model.names[j])
-        low, high = (
-            (-np.inf, np.inf)
-            if joint.nq != 1
-            else (model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q])
-        )
+        joint, name, (low, high) = model.joints[j], str(model.names[j]), _range(model, j)
         if low > high:
             continue  # crossed limits are a mistake of the file, which the robot's checks report
         if not low < high:
@@ -89,8 +94,10 @@ def to_lock(model: pin.Model) -> dict[str, str]:
         elif "JointModelP" in joint.shortname() and effort[joint.idx_v] < weight[joint.idx_v]:
             out[name] = f"{name} cannot lift what it carries"
         elif "JointModelP" in joint.shortname() and high - low > TRAVEL:
-            # what turns such a slide steers the base
-            out |= {str(model.names[i]): "drives a base" for i in model.supports[j] if i >= first}
+            # what turns such a slide, or turns on it without a limit, steers the base
+            steering = [i for i in model.supports[j] if i >= first]
+            steering += [i for i in children[j] if np.ptp(_range(model, i)) > TURN]
+            out |= {str(model.names[i]): "drives a base" for i in steering}
     for j in range(first, model.njoints):  # a hand: several short and light chains on one link
         small = [c for c in children[j] if mass[c] < FINGER_MASS * total and reach[c] < FINGER_LENGTH]
         if len(small) > 1 and len(small) == len(children[j]):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -104,7 +104,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     Raises
     ------
     InputError : it cannot be read; its legs cannot be planned for, with the reason; it stands on legs, and
-        its root has no mass; it is bolted, and no limb can strike.
+        its root has no mass, or bodies have their own `gravcomp`; it is bolted, and no limb can strike.
     """
     first = _floating(path, mjcf, bolted)
     locked = _locked(first)
@@ -113,10 +113,11 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
             f"{path}: its links have no mass, so no motion can be planned; give each an <inertial>, with "
             "mass and inertia"
         )
-    floats = is_floating(first.model) and float(first.model.inertias[1].mass) > 0
+    ties = _only_floating(path, first) if mjcf else []
+    floats = is_floating(first.model) and float(first.model.inertias[1].mass) > 0 and not ties
     found = _made(path, mjcf, floats, locked)
     if is_floating(first.model) and not floats:
-        _check_bolted(first, found)
+        _check_bolted(first, found, ties)
     legs = legs_of(found.robot.model, found.pieces) if floats else ()
     if coupled := _coupled_legs(found.robot, legs):
         locked |= coupled
@@ -181,23 +182,30 @@ def _floating(path: Path, mjcf: bool, bolted: bool) -> Description:
     if is_floating(read.model):
         return read
     try:
-        floating = read_mjcf(path, floating=True)
+        return read_mjcf(path, floating=True)
     except InputError:  # several bodies on the ground
         return read
-    # on a fixed base only it may have `gravcomp` of some bodies
-    return floating if floating.ties == read.ties else read
 
 
-def _check_bolted(first: Description, found: Drafted) -> None:
-    """InputError for a robot on legs whose root has no mass.
+def _only_floating(path: Path, first: Description) -> list[Tie]:
+    """Ties that the robot of an MJCF without a free joint has with a free-flyer only: those of `gravcomp`."""
+    own = read_mjcf(path)
+    return [] if is_floating(own.model) else [tie for tie in first.ties if tie not in own.ties]
 
-    first : with a free-flyer.  found : without, as a free-flyer needs a mass.
+
+def _check_bolted(first: Description, found: Drafted, ties: Sequence[Tie]) -> None:
+    """InputError for a robot on legs that cannot have a free-flyer.
+
+    first : with a free-flyer.  found : without.  ties : that it has with a free-flyer only; if there are
+        none, the root has no mass.
     """
+    what, mend = "the root link has no mass", "give it an <inertial>"
+    if ties:
+        what, mend = ties[0].text, ties[0].fix
     model = lock_joints(first.model, found.options["locked"])
     if legs_of(model, {joint + 1: pieces for joint, pieces in found.pieces.items()}):
         raise InputError(
-            f"{found.path}: the root link has no mass, and the robot stands on legs; give it an "
-            "<inertial>, or bolt it to the ground (--bolted)"
+            f"{found.path}: {what}, and the robot stands on legs; {mend}, or bolt it to the ground (--bolted)"
         )
 
 

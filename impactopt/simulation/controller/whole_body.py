@@ -95,7 +95,7 @@ class TorqueResponse(DenseBody):
 
     A (nv, n), a0 (nv,) : accelerations A tau + a0
     B (6 frames, n), b0 : wrenches of the ground on the frames at their origins, world axes
-    striking_drift (h, 3) [m/s^2] : their accelerations for a = 0
+    striking_drift (h, 3) [m/s^2] : accelerations of the striking points for a = 0
     stabilizing_wrenches : part of b0 that returns the soles to their initial height and tilt
     impulse_response (nv, h) : change of v by a unit impulse against the normal at each striking point
     """

@@ -194,7 +194,8 @@ def test_a_drag_that_grows_with_the_square_of_the_speed_is_refused() -> None:
     @dataclasses.dataclass(frozen=True, kw_only=True)
     class Dragged(FreeMass):
         def derivative(self, state: Any, force: Any, parameters: Any = None) -> list[Any]:
-            return [force / self.mass - 3.0 * state[0] * state[0]]
+            mass = (parameters or self.parameters)["mass"]
+            return [force / mass - 3.0 * state[0] * state[0]]
 
     with pytest.raises(InputError, match="Dragged is not linear"):
         ExactCollision(SDC(robot=slider(4.0), striker="tip", normal=X, law=LAW, target=Dragged(mass=1.0)))

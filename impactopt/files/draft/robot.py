@@ -199,13 +199,13 @@ def _check_bolted(first: Description, found: Drafted, ties: Sequence[Tie]) -> No
     first : with a free-flyer.  found : without.  ties : that it has with a free-flyer only; if there are
         none, the root has no mass.
     """
-    what, mend = "the root link has no mass", "give it an <inertial>"
+    what, fix = "the root link has no mass", "give it an <inertial>"
     if ties:
-        what, mend = ties[0].text, ties[0].fix
+        what, fix = ties[0].text, ties[0].fix
     model = lock_joints(first.model, found.options["locked"])
     if legs_of(model, {joint + 1: pieces for joint, pieces in found.pieces.items()}):
         raise InputError(
-            f"{found.path}: {what}, and the robot stands on legs; {mend}, or bolt it to the ground (--bolted)"
+            f"{found.path}: {what}, and the robot stands on legs; {fix}, or bolt it to the ground (--bolted)"
         )
 
 

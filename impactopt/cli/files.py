@@ -37,7 +37,7 @@ def check(
             found.found += hopeless(problem)
             found.raise_if_any(str(file))
             told = (
-                blocked(problem),
+                *blocked(problem),
                 too_weak(problem),
                 *unusual(problem),
                 *sticks_out(problem),

@@ -178,7 +178,7 @@ def _planned(
         outcome = solver.on(outcome)
     # Reasons that need no search come first.
     failed = ended_with_violations(outcome.program, outcome.result)
-    known = (hopeless(t.problem) or doubts or list(filter(None, [blocked(t.problem)]))) if failed else []
+    known = (hopeless(t.problem) or doubts or blocked(t.problem)) if failed else []
     outcome, causes = (outcome, ()) if known else _diagnosed(outcome, solver)
     gains = chosen_gains(outcome.program, outcome.result.x)
     # Before the replay, which needs a robot with gains of its own.

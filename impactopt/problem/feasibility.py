@@ -17,6 +17,7 @@ from impactopt.kinematics.inverse_kinematics import Reach, inverse_kinematics, r
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.plausibility import giant_soles
+from impactopt.problem.strength import random_postures
 from impactopt.problem.terms import TorqueLimit
 from impactopt.problem.terms.first_touch import face_of
 
@@ -159,45 +160,39 @@ def _nearest(problem: ImpactProblem, polygon: Array) -> Reach:
     return best
 
 
-def blocked(problem: ImpactProblem) -> str:
-    """Message about a hit point where bodies penetrate deeply in all of several postures found; else "".
+def blocked(problem: ImpactProblem) -> list[str]:
+    """Message about a hit point where bodies penetrate deeply in all of several postures found, if any.
 
     There may be others, so that a motion may be found all the same.
     """
     if problem.second is not None or not (problem.keep_out.enabled and problem.self_collision.enabled):
-        return ""
+        return []
     try:
         bodies = problem.bodies
     except InputError:  # of the start posture, which a solve refuses
-        return ""
+        return []
     found = list[Touch]()
     for q in _postures_at_hit(problem):
         at = Places.of(problem.robot, q[None], np.zeros(1), np.zeros(1, dtype=np.intp))
         touches = bodies.survey(np.zeros(1), at).touches
         if not touches or touches[0].depth < BLOCKED_DEPTH:
-            return ""
+            return []
         found.append(touches[0])
     if len(found) < LEAST_AT_HIT:
-        return ""
+        return []
     best = min(found, key=lambda touch: touch.depth)
-    return (
+    return [
         f"in each of {len(found)} postures found at the hit point two bodies penetrate each other, in the "
         f"best one {best.one!r} and {best.other!r} by {1e3 * best.depth:.0f} mm; correct their shapes, or "
         "move the point"
-    )
+    ]
 
 
 def _postures_at_hit(problem: ImpactProblem) -> Iterator[Array]:
     """Configurations (nq,) with the striking point at the hit point: that of the problem, and random ones."""
-    robot, posture, rng = problem.robot, problem.contact_posture, np.random.default_rng(0)
+    p, posture = problem, problem.contact_posture
     yield posture
-    limb = np.array(robot.limb(robot.striker(problem.striker).model_frame), dtype=np.intp)
-    # drawn in all of the joints' ranges, as an arm reaches a point in several ways
-    lower, upper = (np.where(np.isfinite(x), x, y) for x, y in ((robot.lower, -np.pi), (robot.upper, np.pi)))
-    for _ in range(DRAWN_AT_HIT):
-        step: Array = np.zeros(robot.nv)
-        drawn = rng.uniform(lower[limb], upper[limb])
-        step[robot.nv - robot.n + limb] = drawn - robot.joint_positions(posture)[limb]
-        guess = pin.integrate(robot.model, posture, step)
+    # an arm reaches a point in several ways
+    for guess in random_postures(p.robot, p.striker, posture, DRAWN_AT_HIT):
         with contextlib.suppress(InputError):
-            yield inverse_kinematics(problem.coordinates, problem.striker, problem.point, guess, starts=1)
+            yield inverse_kinematics(p.coordinates, p.striker, p.point, guess, starts=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
@@ -244,7 +244,7 @@ def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
     if hand is None or robot.floating or p.second is not None:
         return p.contact_posture
     model, data = robot.model, robot.model.createData()
-    frame, first = model.getFrameId(robot.striker(p.striker).model_frame), robot.nv - robot.n
+    frame = model.getFrameId(robot.striker(p.striker).model_frame)
     facing = np.array(hand.axis), p.normal if hand.direction is None else np.array(hand.direction)
     min_cosine = float(np.cos(hand.angle))
 
@@ -255,14 +255,9 @@ def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
     if faces(p.contact_posture):
         return p.contact_posture
     strength = Strength(robot=robot, striker=p.striker, law=p.law, target=p.target)
-    limb = np.array(robot.limb(robot.striker(p.striker).model_frame))
-    rng, start = np.random.default_rng(seed), robot.joint_positions(p.start_posture)
-    low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
+    start = robot.joint_positions(p.start_posture)
     best, chosen = 0.0, p.contact_posture
-    for _ in range(ATTEMPTS):
-        step = np.zeros(robot.nv)
-        step[first + limb] = rng.uniform(low, high) - start[limb]
-        guess = pin.integrate(model, p.start_posture, step)
+    for guess in random_postures(robot, p.striker, p.start_posture, ATTEMPTS, seed):
         with suppress(InputError):
             q = inverse_kinematics(p.coordinates, p.striker, p.point, guess, facing=facing, starts=1)
             if not faces(q) or (p.keeps_apart and touches(p, q)):
@@ -275,6 +270,20 @@ def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
             if estimate > best:
                 best, chosen = estimate, q
     return chosen
+
+
+def random_postures(robot: Robot, striker: str, q: Array, count: int, seed: int = 0) -> Iterator[Array]:
+    """A configuration q (nq,) with the joints that move a striker drawn within their limits, several times.
+
+    Joints without limits, or with wider ones, are drawn between -pi and pi.
+    """
+    limb = np.array(robot.limb(robot.striker(striker).model_frame))
+    rng, own = np.random.default_rng(seed), robot.joint_positions(q)[limb]
+    low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
+    for _ in range(count):
+        step = np.zeros(robot.nv)
+        step[robot.nv - robot.n + limb] = rng.uniform(low, high) - own
+        yield np.asarray(pin.integrate(robot.model, q, step))
 
 
 def touches(problem: ImpactProblem, *postures: Array) -> bool:

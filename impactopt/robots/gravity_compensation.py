@@ -7,7 +7,7 @@ above a turntable, or that are so light that their weight hardly matters, as fin
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -39,9 +39,9 @@ class Compensation:
     loads [N m], [N] : upper bounds, by joint, of the torque by which the weight of these bodies is wrong.
     """
 
-    fraction: float
-    others: tuple[str, ...]
-    loads: Mapping[str, float]
+    fraction: float = 0.0
+    others: tuple[str, ...] = ()
+    loads: Mapping[str, float] = field(default_factory=dict)
 
     def negligible(self, torque: Mapping[str, float]) -> dict[str, float]:
         """Loads over the torque limits [N m] of the joints, of those that are negligible."""

@@ -70,44 +70,33 @@ class Compiled:
         return np.asarray(getattr(self.mj, name, np.zeros(0)))
 
 
-def ties_of(c: Compiled, torque: Mapping[str, float]) -> Iterator[Tie]:
+def ties_of(c: Compiled, gravcomp: Compensation, torque: Mapping[str, float]) -> Iterator[Tie]:
     """Ties of the robot's joints: nonlinear forces, equalities, tendons, and partial gravity compensation.
 
+    gravcomp : as of `gravcomp_of`.
     torque [N m] : limits by joint, over which the compensation of light bodies is neglected.
     """
     yield from _nonlinear_joints(c)
     if not c.off("equality", "constraint"):
         yield from _equalities(c)
     yield from _tendons(c)
-    yield from _partly_weightless(c, torque)
+    yield from _partly_weightless(gravcomp, {} if c.floating else torque)
 
 
-def gravity_of(c: Compiled) -> Array:
-    """Gravity (3,) [m/s2], reduced by the bodies' `gravcomp`."""
-    if c.off("gravity"):
-        return np.zeros(3)
-    found = _gravcomp(c)
-    return np.array(c.mj.opt.gravity) * (1.0 - (0.0 if found is None else found.fraction))
+def notes_of(c: Compiled, gravcomp: Compensation, torque: Mapping[str, float]) -> Iterator[str]:
+    """Notes on features that are left out, or are treated differently than by MuJoCo.
 
-
-def notes_of(c: Compiled, torque: Mapping[str, float]) -> Iterator[str]:
-    """Notes on features that are left out, or are treated differently than by MuJoCo; torque [N m] : limits
-    by joint.
+    gravcomp : as of `gravcomp_of`.  torque [N m] : limits by joint.
     """
-    mj = c.mj
-    found = _gravcomp(c)
-    if found is not None and found.fraction:
-        which = (
-            f"{'most' if found.others else 'all'} bodies that joints lift have gravcomp {found.fraction:g}"
-        )
-        yield f"{which}: motors carry {1 - found.fraction:g} times the weight, as in MuJoCo"
-    shares = {} if found is None else found.negligible(torque)
-    if found is not None and shares:
+    mj, fraction = c.mj, gravcomp.fraction
+    if fraction:
+        which = f"{'most' if gravcomp.others else 'all'} bodies that joints lift have gravcomp {fraction:g}"
+        yield f"{which}: motors carry {1 - fraction:g} times the weight, as in MuJoCo"
+    if shares := gravcomp.negligible(torque):
         joint = max(shares, key=lambda joint: shares[joint])
         yield (
-            f"the gravcomp of {', '.join(map(repr, found.others))} is not that of the rest, and is left out: "
-            f"at most {found.loads[joint]:.2g} N m of {joint!r}, {100 * shares[joint]:.2g} % of the "
-            "file's limit"
+            f"{_differing(gravcomp)}, and is left out: at most {gravcomp.loads[joint]:.2g} N m of {joint!r}, "
+            f"{100 * shares[joint]:.2g} % of the file's limit"
         )
     if mj.opt.density > 0 or mj.opt.viscosity > 0:
         yield "fluid drag is left out: <option density, viscosity>"
@@ -129,13 +118,13 @@ def notes_of(c: Compiled, torque: Mapping[str, float]) -> Iterator[str]:
         yield f"plugins of {', '.join(plugged)} are left out"
 
 
-def _gravcomp(c: Compiled) -> Compensation | None:
-    """Gravity compensation of the moving bodies; None without gravity, and if motors apply it."""
+def gravcomp_of(c: Compiled) -> Compensation:
+    """Gravity compensation of the moving bodies; none without gravity, and if motors apply it."""
     mj, gravity = c.mj, np.array(c.mj.opt.gravity)
     by_motors = c.numbers("jnt_actgravcomp")[sorted(c.joint)]
     # that of motors is part of their torque, inside its limits: this is ordinary gravity
     if c.off("gravity") or not gravity.any() or (by_motors.size and by_motors.all() and not c.floating):
-        return None
+        return Compensation()
     bodies = [
         CompensatedBody(
             name=c.name("body", b),
@@ -149,18 +138,16 @@ def _gravcomp(c: Compiled) -> Compensation | None:
     return compensation(c.model, gravity, bodies)
 
 
-def _partly_weightless(c: Compiled, torque: Mapping[str, float]) -> Iterator[Tie]:
+def _partly_weightless(gravcomp: Compensation, torque: Mapping[str, float]) -> Iterator[Tie]:
     """Different `gravcomp` of bodies, for which the equations of motion have no gravity vector."""
-    found = _gravcomp(c)
-    light = {} if found is None else found.negligible({} if c.floating else torque)
-    heavy = () if found is None else tuple(joint for joint in found.loads if joint not in light)
-    if found is not None and heavy:
-        yield Tie(
-            text=f"the gravcomp of {', '.join(map(repr, found.others))} is not that of the rest",
-            joints=heavy,
-            free=0,
-            fix="give all of them the same",
-        )
+    light = gravcomp.negligible(torque)
+    if heavy := tuple(joint for joint in gravcomp.loads if joint not in light):
+        yield Tie(text=_differing(gravcomp), joints=heavy, free=0, fix="give all of them the same")
+
+
+def _differing(gravcomp: Compensation) -> str:
+    """The bodies with another `gravcomp`, as the beginning of a message."""
+    return f"the gravcomp of {', '.join(map(repr, gravcomp.others))} is not that of the rest"
 
 
 def _nonlinear_joints(c: Compiled) -> Iterator[Tie]:
@@ -420,10 +407,12 @@ class _Reader(Compiled):
             q = pin.neutral(self.model)
             q[3:7] = pin.Quaternion(_rotation(self.mj.body_quat[self.roots[0]])).coeffs()
             self.model.referenceConfigurations[ROOT] = q
-        self.model.gravity = pin.Motion(gravity_of(self), np.zeros(3))
-        self.out.ties += ties_of(self, self.out.torque)
+        gravcomp = gravcomp_of(self)
+        gravity = np.zeros(3) if self.off("gravity") else np.array(self.mj.opt.gravity)
+        self.model.gravity = pin.Motion((1.0 - gravcomp.fraction) * gravity, np.zeros(3))
+        self.out.ties += ties_of(self, gravcomp, self.out.torque)
         self.out.tendons += tendons_of(self)
-        self.out.notes += notes_of(self, self.out.torque)
+        self.out.notes += notes_of(self, gravcomp, self.out.torque)
         self.out.lead_from_root()
         return self.out
 

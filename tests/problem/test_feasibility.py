@@ -88,9 +88,9 @@ def test_a_hit_point_inside_an_obstacle_is_told_before_a_stiffness() -> None:
     problem = load_problem("arm_planar")
     below, above = ([*problem.point[:2], problem.point[2] + dz] for dz in (-0.3, 0.05))
     shelf = Obstacle(name="shelf", size=(0.3, 0.3, 0.1), position=tuple(below))
-    assert blocked(dataclasses.replace(problem, obstacles=(shelf,))) == ""
+    assert blocked(dataclasses.replace(problem, obstacles=(shelf,))) == []
     inside = dataclasses.replace(problem, obstacles=(dataclasses.replace(shelf, position=tuple(above)),))
-    said = blocked(inside)
+    (said,) = blocked(inside)
     assert "'shelf' by " in said
     with pytest.warns(NotSolvedWarning, match="Infeasible: " + re.escape(said)):
         solve(inside, options={"max_iterations": 10})
@@ -102,7 +102,7 @@ def test_an_obstacle_is_not_in_the_way_of_an_arm_that_reaches_round_it() -> None
     problem = load_problem("arm_planar")
     up = dataclasses.replace(problem, start=np.array([0.6, -1.7, -0.47]), terms=(), obstacles=(box,))
     assert touches(up, up.contact_posture)
-    assert blocked(up) == "" and hopeless(up) == []
+    assert blocked(up) == [] and hopeless(up) == []
 
 
 def test_a_fixed_base_is_not_asked_for_balance() -> None:

@@ -106,14 +106,13 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     InputError : it cannot be read; its legs cannot be planned for, with the reason; it stands on legs, and
         its root has no mass, or bodies have their own `gravcomp`; it is bolted, and no limb can strike.
     """
-    first = _floating(path, mjcf, bolted)
+    first, ties = _floating(path, mjcf, bolted)
     locked = _locked(first)
     if not any(body.mass for body in list(first.model.inertias)[1 + is_floating(first.model) :]):
         raise InputError(
             f"{path}: its links have no mass, so no motion can be planned; give each an <inertial>, with "
             "mass and inertia"
         )
-    ties = _only_floating(path, first) if mjcf else []
     floats = is_floating(first.model) and float(first.model.inertias[1].mass) > 0 and not ties
     found = _made(path, mjcf, floats, locked)
     if is_floating(first.model) and not floats:
@@ -171,26 +170,22 @@ def _idle(model: pin.Model, arms: tuple[Limb, ...]) -> dict[str, str]:
     }
 
 
-def _floating(path: Path, mjcf: bool, bolted: bool) -> Description:
-    """The robot with a free-flyer at its root, unless it is bolted or has several roots.
+def _floating(path: Path, mjcf: bool, bolted: bool) -> tuple[Description, list[Tie]]:
+    """The robot with a free-flyer at its root, unless it is bolted or has several roots; and the ties of an
+    added free-flyer, those of `gravcomp`.
 
     Many MJCFs of humanoids have no free joint, as the scene adds it.
     """
     if bolted or not mjcf:
-        return _read(path, mjcf, not bolted)
+        return _read(path, mjcf, not bolted), []
     read = read_mjcf(path)
     if is_floating(read.model):
-        return read
+        return read, []
     try:
-        return read_mjcf(path, floating=True)
+        floating = read_mjcf(path, floating=True)
     except InputError:  # several bodies on the ground
-        return read
-
-
-def _only_floating(path: Path, first: Description) -> list[Tie]:
-    """Ties that the robot of an MJCF without a free joint has with a free-flyer only: those of `gravcomp`."""
-    own = read_mjcf(path)
-    return [] if is_floating(own.model) else [tie for tie in first.ties if tie not in own.ties]
+        return read, []
+    return floating, [tie for tie in floating.ties if tie not in read.ties]
 
 
 def _check_bolted(first: Description, found: Drafted, ties: Sequence[Tie]) -> None:

@@ -11,7 +11,7 @@ This is never less than the hull's own and at most e log k more, if k vertices a
 The distance then has derivatives of all orders. By the envelope theorem its gradient is that of s at the best
 u, and its Hessian is s_qq - s_qu (s_uu)^-1 s_uq, with derivatives by u on the tangents of the unit sphere.
 
-The vertices are those of a hull within `THIN` of the body's own. In C (native/separation.c) a
+The vertices are those of a hull within `THIN` of the body's own. In C (separation.c) a
 distance takes 1 to 2 us in `punch`; without a compiler `separation_numpy` does the same.
 """
 

@@ -1,4 +1,4 @@
-"""NumPy version of native/separation.c, for machines without a compiler: same results, 100 times slower."""
+"""NumPy version of separation.c, for machines without a compiler: same results, 100 times slower."""
 
 from __future__ import annotations
 

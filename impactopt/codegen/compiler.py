@@ -230,11 +230,11 @@ Buildable = Any  # ca.Function or NativeCode
 
 
 def native_library(package: str, name: str) -> Any:
-    """The library of ``native/NAME.c`` in a package, loaded; None where no compiler can make it."""
+    """The library of ``NAME.c`` in a package, loaded; None where no compiler can make it."""
     compiler = find_compiler()
     if compiler is None:
         return None
-    code = files(f"{package}.native").joinpath(f"{name}.c").read_text(encoding="utf-8")
+    code = files(package).joinpath(f"{name}.c").read_text(encoding="utf-8")
     directory = usable_directory()
     try:
         with (

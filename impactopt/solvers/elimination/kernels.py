@@ -1,4 +1,4 @@
-"""Kernels of condensed Newton systems: small dense algebra in NumPy, and the same in C (`native/newton.c`).
+"""Kernels of condensed Newton systems: small dense algebra in NumPy, and the same in C (`newton.c`).
 
 NumPy is used if there is no compiler, with the same arrays.
 """

@@ -1,1 +1,0 @@
-"""C code, compiled when it is first needed."""

@@ -1,1 +1,0 @@
-"""C kernels of the elimination."""

@@ -1,1 +1,0 @@
-"""C sources of scatter-adds and instruction tables."""

@@ -30,7 +30,7 @@ from scipy.linalg.lapack import dgesv
 from impactopt.errors import InputError
 from impactopt.robots.build import joint_indices
 from impactopt.robots.checks import LEG, check_arms, check_legs
-from impactopt.robots.joint_angles import JointAngles
+from impactopt.robots.model import JointAngles
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.tools import check_held

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import MOST, InputError, check_direction, check_number
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import Stance, usual_stance
-from impactopt.robots.mass_matrix import mass_matrix
+from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from impactopt.contact.targets import FreeMass, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.terms import FirstTouch, HandOrientation, TorqueLimit
-from impactopt.robots.mass_matrix import mass_matrix
+from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 
 if TYPE_CHECKING:

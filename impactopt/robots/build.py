@@ -18,7 +18,7 @@ from impactopt.errors import InputError, check_array, check_choice, raw_array, s
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Striker
 from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame, reduced, tell_apart
-from impactopt.robots.joint_angles import JointAngles
+from impactopt.robots.model import JointAngles
 
 Array = NDArray[np.float64]
 MAX_ATTACHMENTS = 100  # soles, strikers or tools of a robot; more are a mistake

@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, counted, did_you_mean
-from impactopt.robots.mass_matrix import mass_matrix
+from impactopt.robots.model import mass_matrix
 
 _MARK = "\x00"  # no name in a file contains it
 

@@ -26,7 +26,7 @@ from impactopt.errors import InputError, missing_package
 from impactopt.robots.build import ROOT, existing, friction, set_friction
 from impactopt.robots.description import Description, Tie, between
 from impactopt.robots.gravity_compensation import CompensatedBody, Compensation, compensation
-from impactopt.robots.joint_angles import JointAngles
+from impactopt.robots.model import JointAngles
 from impactopt.robots.tendons import Tendon
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, 
 from impactopt.robots.checks import GIVEN, REPAIRED, check_inertias, tell_apart
 from impactopt.robots.couplings import Coupling, couplings_of, follower_axes, restore_followers
 from impactopt.robots.forward_kinematics import ForwardKinematics
-from impactopt.robots.joint_angles import JointAngles
+from impactopt.robots.model import JointAngles
 from impactopt.robots.tendons import Ranges, Tendon, check_tendons
 from impactopt.robots.tools import check_sole, with_hinges
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
-from impactopt.robots.mass_matrix import mass_matrix
+from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 from impactopt.simulation.sliding_points import SlidingPoints
 

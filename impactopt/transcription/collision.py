@@ -20,7 +20,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
-from impactopt.robots.mass_matrix import mass_matrix
+from impactopt.robots.model import mass_matrix
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, FORCE_SCALE, typical_state

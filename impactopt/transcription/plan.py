@@ -31,7 +31,7 @@ from impactopt.robots.loads import (
     least_margins,
     weight_of,
 )
-from impactopt.robots.mass_matrix import mass_matrix
+from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]

@@ -35,7 +35,7 @@ from impactopt import (
 )
 from impactopt.codegen.cache import model_hash
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
-from impactopt.robots.mass_matrix import mass_matrix
+from impactopt.robots.model import mass_matrix
 from impactopt.simulation.mujoco_world import MujocoOptions, MujocoRobot, mujoco_module, robot_bodies, spec_of
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.files.export.content import Export, body_name
 from impactopt.files.export.motion import Motion, motion_at
-from impactopt.robots.joint_angles import JointAngles
+from impactopt.robots.model import JointAngles
 
 Array = NDArray[np.float64]
 

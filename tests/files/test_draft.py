@@ -667,6 +667,14 @@ def test_what_the_file_lacks_is_guessed_and_said_to_be(tmp_path: Path) -> None:
     assert sum("guessed" in line for line in draft.said) == 4  # and the gains
 
 
+def test_motors_that_cannot_hold_the_arm_are_told(tmp_path: Path) -> None:
+    """As of files that give each joint the same placeholder."""
+    draft = _drafted(tmp_path, urdfs.arm(effort=9.0), planned=True)
+    (told,) = [line for line in draft.said if "no whole motion" in line]
+    (why,) = [line for line in draft.said if "do not hold the robot's own weight" in line]
+    assert draft.said.index(why) == draft.said.index(told) + 1
+
+
 def test_a_limit_that_no_motor_has_is_none(tmp_path: Path) -> None:
     """Exporters write 1e9 where a model has no limit: as a torque, it would have a rotor of 1e6 kg m2."""
     drafted = _robot(tmp_path, urdfs.arm(effort=1e9, velocity=1e9))

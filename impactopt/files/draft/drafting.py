@@ -35,7 +35,7 @@ from impactopt.files.toml import Place, plain_value, write_toml
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import StrikeSolution, optimize_strike
-from impactopt.problem.feasibility import hopeless
+from impactopt.problem.feasibility import hopeless, too_weak
 from impactopt.problem.plausibility import light_links, shape_doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import DOWN, touches
@@ -211,11 +211,14 @@ def _bolted(
 
         best = _hardest_planned(data_of, strong, folder, say) if planned else None
         data = data_of(best[0] if best else 0)
-        if planned and not best:
+        # more time does not help motors that cannot hold the arm
+        weak = too_weak(_built(data, folder)) if planned and not best else ""
+        if planned and not best and not weak:
             best = _hardest_planned(lambda k: _slower(data_of(k)), strong, folder, say)
             data = _slower(data_of(best[0] if best else 0))
         messages = [
             _strike_message(strong, best, tried=planned),
+            *([weak] if weak else []),
             *([EDGEWISE] if edgewise else []),
             *([PEGGED] if pegged else []),
         ]

@@ -609,8 +609,11 @@ class BarrierProblem:
             return None
 
     # ------------------------------------------------------------------ Newton step
-    def step(self, residual: Vector) -> Step | None:
-        """Newton step; None if the Hessian cannot be computed, or the matrix not be factored."""
+    def step(self, residual: Vector, least_shift: float = 0.0) -> Step | None:
+        """Newton step; None if the Hessian cannot be computed, or the matrix not be factored.
+
+        least_shift : of the Hessian.
+        """
         point, hard = self.point, self.elastic is None
         hessian = self._hessian(self.sigma)
         if hessian is None:
@@ -622,6 +625,7 @@ class BarrierProblem:
             self._weights,
             hard=hard,
             proximal=_PROXIMAL * self.mu if hard else 0.0,
+            least=least_shift,
         )
         return self.step_for(residual) if factored else None
 

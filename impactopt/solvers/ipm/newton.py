@@ -275,6 +275,7 @@ class NewtonSystem:
         *,
         hard: bool,
         proximal: float = 0.0,
+        least: float = 0.0,
     ) -> bool:
         """Factor the system, with the least shift of a growing sequence that makes it positive definite.
 
@@ -284,6 +285,7 @@ class NewtonSystem:
         weights : gives the weights (k,) of the constraints that remain, for a shift of all variables and
             slacks: proximal plus the shift of the Hessian.
         hard : whether equalities have no weights and are met exactly.
+        least : shift to try first, if it is larger than that of the sequence.
 
         Returns
         -------
@@ -304,7 +306,7 @@ class NewtonSystem:
         of_all[c.free] = diagonal
         # Elastic equalities have weights as inequalities do: they need not be met exactly.
         penalty = self._penalty() if hard else None
-        self.shift = self._initial_shift()
+        self.shift = max(least, self._initial_shift())
         while True:
             shift = proximal + self.shift
             self._diagonal = of_all + shift

@@ -267,7 +267,8 @@ def _settings(model: SteppedModel, settings: Mapping[str, Any], count: int) -> d
             # The range of a number is an interval: least and largest suffice. Directions and matrices are
             # checked one by one.
             whole = name == "normal" or (name in ("kp", "kd") and default.ndim == 2)
-            for one in value if whole else (value.min(axis=0), value.max(axis=0)):
+            extremes = np.unique([value.min(axis=0), value.max(axis=0)], axis=0)
+            for one in value if whole else extremes:
                 model.settings.override({name: one})
             capped = np.minimum(value, NO_LIMIT) if name == "torque_limit" else value
             out[name] = capped if default.ndim else capped.reshape(count, 1)

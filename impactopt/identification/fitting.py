@@ -47,15 +47,12 @@ def _heavy_hand() -> Robot:
 class ContactHistory:
     """History of one simulated contact at its instants (k,).
 
-    time [s] since the touch; force [N] and its slope [N/s]; impulse [N s] so far; impulse_integral [N s2],
-    which over a mass is the displacement by the contact.
+    time [s] since the touch; force [N]; impulse [N s] so far.
     """
 
     time: Array
     force: Array
-    slope: Array
     impulse: Array
-    impulse_integral: Array
 
     def force_at(self, t: Array) -> Array:
         """Force [N] at times [s] since the touch; zero before and after the contact."""
@@ -63,16 +60,19 @@ class ContactHistory:
 
     def slope_at(self, t: Array) -> Array:
         """Slope [N/s] of the force at times [s] since the touch."""
-        return np.interp(t, self.time, self.slope, left=0.0, right=0.0)
+        return np.interp(t, self.time, np.gradient(self.force, self.time), left=0.0, right=0.0)
 
     def impulse_at(self, t: Array) -> Array:
         """Impulse [N s] up to times [s] since the touch."""
         return np.interp(t, self.time, self.impulse)
 
     def impulse_integral_at(self, t: Array) -> Array:
-        """Integral [N s2] of the impulse up to times [s] since the touch; it grows on after the contact."""
+        """Integral [N s2] of the impulse up to times [s] since the touch; it grows on after the contact.
+
+        Over a mass it is the displacement by the contact.
+        """
         after = self.impulse[-1] * np.maximum(t - self.time[-1], 0.0)
-        return np.interp(t, self.time, self.impulse_integral) + after
+        return np.interp(t, self.time, cumulative_trapezoid(self.impulse, self.time, initial=0.0)) + after
 
 
 class TwoMassModel:
@@ -125,13 +125,10 @@ class TwoMassModel:
 
 def _history(time: Array, force: Array, impulse: Array) -> ContactHistory:
     """History from padded arrays (k,)."""
-    if not np.isfinite(time).all():  # no contact, as of a law without any force
-        zero = np.zeros(2)
-        return ContactHistory(np.array([0.0, 1e-9]), zero, zero, zero, zero)
     last = int(np.searchsorted(time, time[-1])) + 1  # padding repeats the last instant
-    t, f, J = time[:last], force[:last], impulse[:last]
-    integral = cumulative_trapezoid(J, t, initial=0.0)
-    return ContactHistory(t, f, np.gradient(f, t) if last > 1 else 0.0 * f, J, integral)
+    if not np.isfinite(time).all() or last < 2:  # no contact, as of a law without any force
+        return ContactHistory(np.array([0.0, 1e-9]), np.zeros(2), np.zeros(2))
+    return ContactHistory(time[:last], force[:last], impulse[:last])
 
 
 _MAX_DURATION = 2.5  # of a simulated contact, over the longest measured one

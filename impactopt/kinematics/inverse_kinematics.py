@@ -85,6 +85,7 @@ def reach(
 
 
 FACING_STEPS = 100  # first steps of each attempt, in which the striker's orientation is an aim too
+FACING_STEP = 1e-10  # [rad], [m] least step that still turns the striker
 FACING_DAMPING = 0.1  # of orientation; position and soles have 1e-8, so that these come first
 # [rad] standard deviation of random joint offsets from the guess: in the first attempt, if it has an
 # orientation to reach, and in later attempts
@@ -141,6 +142,7 @@ def inverse_kinematics(
         if k or facing is not None:
             offsets = (SPREAD if k else FIRST_SPREAD) * rng.standard_normal(robot.n)
             q = pin.integrate(model, q, np.concatenate([np.zeros(base), offsets]))
+        step = np.full(model.nv, np.inf)
         for iteration in range(200):
             q[place] = np.clip(q[place], lower[limited], upper[limited])
             pin.computeJointJacobians(model, data, q)
@@ -158,7 +160,7 @@ def inverse_kinematics(
             off = float(np.abs(np.concatenate(errors)).max())
             best_gap = min(best_gap, off)
             orienting = facing is not None and iteration < FACING_STEPS
-            if off < tolerance and not orienting:
+            if off < tolerance and (not orienting or np.abs(step).max() < FACING_STEP):
                 return q
             damping = np.full(6 * len(coordinates.legs) + 3 * len(hands), 1e-8)
             if facing is not None and orienting:  # fid, hand: of the striker, the last in the loop above
@@ -207,7 +209,7 @@ def _least_rotation(axis: Array, direction: Array, across: Array) -> Array:
 
     Unit vectors (3,). Opposite ones have no unique rotation; then it is half a turn about ``across``.
     """
-    cross, cosine = np.cross(axis, direction), float(axis @ direction)
+    cross, cosine = pin.skew(axis) @ direction, float(axis @ direction)
     sine = float(np.linalg.norm(cross))
     if sine < 1e-9:
         return np.zeros(3) if cosine > 0 else np.pi * across

@@ -70,15 +70,15 @@ def contact_wrench_cone(polygon: ArrayLike, friction: float, *, margin: float = 
     """
     if not friction > 0:
         raise InputError(f"friction must be positive, not {friction}")
-    corners = shrink(polygon, margin)
-    return _facets(tuple(map(tuple, corners.tolist())), float(friction)).copy()
+    corners = np.asarray(polygon, dtype=float).tolist()
+    return _facets(tuple(map(tuple, corners)), float(friction), float(margin)).copy()
 
 
 @functools.lru_cache(maxsize=64)  # every node of a program needs those of the same few soles
-def _facets(corners: tuple[tuple[float, float], ...], friction: float) -> Array:
+def _facets(polygon: tuple[tuple[float, float], ...], friction: float, margin: float) -> Array:
     # rays of the cone: forces along the four edges of the friction pyramid at each corner
     rays = []
-    for x, y in corners:
+    for x, y in shrink(polygon, margin):
         for fx, fy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
             # Facets do not depend on the length of rays, so f_z = 1.
             f = np.array([friction * fx, friction * fy, 1.0])

@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
-from typing import Any
-from xml.dom import expatbuilder
-from xml.parsers.expat import ExpatError
+from xml.etree.ElementTree import Element, TreeBuilder, tostring
+from xml.parsers.expat import ExpatError, ParserCreate
 
 import numpy as np
 import pinocchio as pin
@@ -44,7 +43,7 @@ def read_urdf(
     urdf = existing(path, "URDF")
     joints = (pin.JointModelFreeFlyer(),) if floating else ()
     root = _parsed(urdf)
-    if any(tag.tagName.startswith("xacro:") for tag in root.getElementsByTagName("*")):
+    if any(tag.tag.startswith("xacro:") for tag in root.iter()):
         raise InputError(
             f"{urdf} is a xacro file, not yet a URDF: run `xacro {Path(urdf).name} > robot.urdf`, and give "
             "robot.urdf"
@@ -52,7 +51,7 @@ def read_urdf(
     _check_limits(root, urdf)
     try:
         if _without_negative_limits(root):
-            model = pin.buildModelFromXML(root.toxml(), *joints)
+            model = pin.buildModelFromXML(tostring(root, encoding="unicode"), *joints)
         else:
             model = pin.buildModelFromUrdf(urdf, *joints)
     except (ValueError, RuntimeError) as error:
@@ -74,57 +73,62 @@ def read_urdf(
     return out
 
 
-def _parsed(urdf: str) -> Any:
+def _parsed(urdf: str) -> Element:
     """Root element of a URDF."""
+    # files may have tags of other tools with undeclared prefixes, hence a parser without namespaces
+    parser, tree = ParserCreate(), TreeBuilder()
+    parser.StartElementHandler, parser.EndElementHandler = tree.start, tree.end
+    parser.CharacterDataHandler = tree.data
     try:
-        # files may have tags of other tools with undeclared prefixes, hence no namespaces
-        return expatbuilder.parse(urdf, namespaces=False).documentElement
+        with open(urdf, "rb") as file:
+            parser.ParseFile(file)
     except ExpatError as error:
         raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
+    return tree.close()
 
 
-def _check_limits(root: Any, urdf: str) -> None:
+def _check_limits(root: Element, urdf: str) -> None:
     """InputError with all joints that lack a limit of effort or velocity, without which no URDF is read."""
     found = Mistakes()
-    for joint in _children(root, "joint"):
-        limits, kind = _children(joint, "limit"), joint.getAttribute("type")
+    for joint in root.findall("joint"):
+        limits, kind = joint.findall("limit"), joint.get("type", "")
         if limits:
-            lacks = [key for key in ("effort", "velocity") if not limits[0].getAttribute(key)]
+            lacks = [key for key in ("effort", "velocity") if not limits[0].get(key, "")]
         else:
             lacks = ["effort", "velocity"] if kind in ("revolute", "prismatic") else []
         if lacks:
             keys = " and ".join(lacks)
             found.found.append(
-                f"URDF {urdf}: joint {joint.getAttribute('name')!r} has no {keys} in a <limit>; give {keys} "
+                f"URDF {urdf}: joint {joint.get('name', '')!r} has no {keys} in a <limit>; give {keys} "
                 "there, 0 if unknown"
             )
     found.raise_if_any(f"URDF {urdf}")
 
 
-def _without_negative_limits(root: Any) -> bool:
+def _without_negative_limits(root: Element) -> bool:
     """Set negative limits of torque and speed, which stand for none as in SDF, to 0; True if there are any.
 
     Pinocchio refuses them.
     """
     negative = [
         (limit, key)
-        for joint in _children(root, "joint")
-        for limit in _children(joint, "limit")
+        for joint in root.findall("joint")
+        for limit in joint.findall("limit")
         for key in ("effort", "velocity")
-        if _urdf_number(limit.getAttribute(key)) < 0
+        if _urdf_number(limit.get(key, "")) < 0
     ]
     for limit, key in negative:
-        limit.setAttribute(key, "0")
+        limit.set(key, "0")
     return bool(negative)
 
 
-def _mimics(root: Any, model: pin.Model) -> Iterator[Tie]:
+def _mimics(root: Element, model: pin.Model) -> Iterator[Tie]:
     """Joints that follow others."""
-    every = [joint.getAttribute("name") for joint in _children(root, "joint")]
-    for joint in _children(root, "joint"):
-        name = joint.getAttribute("name")
-        for mimic in _children(joint, "mimic"):
-            other = mimic.getAttribute("joint")
+    every = [joint.get("name", "") for joint in root.findall("joint")]
+    for joint in root.findall("joint"):
+        name = joint.get("name", "")
+        for mimic in joint.findall("mimic"):
+            other = mimic.get("joint", "")
             text = f"joint {name!r} follows {other!r} by <mimic>"
             if model.existJointName(name) and other not in every:
                 text += f", and there is no such joint{did_you_mean(other, every)}"
@@ -135,18 +139,18 @@ def _mimics(root: Any, model: pin.Model) -> Iterator[Tie]:
                     joints=(name, other),
                     follower=name,
                     follows=(
-                        _urdf_number(mimic.getAttribute("offset")),
-                        _urdf_number(mimic.getAttribute("multiplier") or "1"),
+                        _urdf_number(mimic.get("offset", "")),
+                        _urdf_number(mimic.get("multiplier", "") or "1"),
                     ),
                 )
 
 
-def _hollow(root: Any, model: pin.Model) -> Iterator[Tie]:
+def _hollow(root: Element, model: pin.Model) -> Iterator[Tie]:
     """Moving links with shapes and without mass. One without shapes may just connect two joints."""
     shaped = {
-        link.getAttribute("name")
-        for link in _children(root, "link")
-        if _children(link, "visual") or _children(link, "collision")
+        link.get("name", "")
+        for link in root.findall("link")
+        if link.findall("visual") or link.findall("collision")
     }
     for frame in model.frames:
         joint = frame.parentJoint
@@ -160,33 +164,33 @@ def _hollow(root: Any, model: pin.Model) -> Iterator[Tie]:
             )
 
 
-def _unranged(root: Any) -> Iterator[str]:
+def _unranged(root: Element) -> Iterator[str]:
     """Revolute joints of a file that has neither `lower` nor `upper`, whose default is 0, except followers.
 
     In a file that has some, those without are passive joints of loops, and fixed.
     """
-    joints = [joint for joint in _children(root, "joint") if joint.getAttribute("type") == "revolute"]
-    limits = [limit for joint in joints for limit in _children(joint, "limit")]
-    if not any(limit.hasAttribute(key) for limit in limits for key in ("lower", "upper")):
-        yield from (joint.getAttribute("name") for joint in joints if not _children(joint, "mimic"))
+    joints = [joint for joint in root.findall("joint") if joint.get("type", "") == "revolute"]
+    limits = [limit for joint in joints for limit in joint.findall("limit")]
+    if not any(key in limit.attrib for limit in limits for key in ("lower", "upper")):
+        yield from (joint.get("name", "") for joint in joints if not joint.findall("mimic"))
 
 
-def _springs(root: Any, model: pin.Model) -> dict[str, tuple[float, float]]:
+def _springs(root: Element, model: pin.Model) -> dict[str, tuple[float, float]]:
     """Gazebo's springs by joint: stiffness [N m/rad] and rest angle [rad]."""
     out = {}
-    for gazebo in _children(root, "gazebo"):
-        name = gazebo.getAttribute("reference")
+    for gazebo in root.findall("gazebo"):
+        name = gazebo.get("reference", "")
         stiffness, rest = (list(_numbers(gazebo, f"spring{key}")) for key in ("Stiffness", "Reference"))
         if model.existJointName(name) and any(stiffness):
             out[name] = stiffness[0], (rest or [0.0])[0]
     return out
 
 
-def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
+def _of_gazebo(root: Element, model: pin.Model) -> Iterator[Tie]:
     """Closed loops, which Gazebo's extensions can describe and URDF cannot."""
-    for gazebo in _children(root, "gazebo"):
-        for loop in _children(gazebo, "joint"):
-            ends = [_text(end) for tag in ("parent", "child") for end in _children(loop, tag)]
+    for gazebo in root.findall("gazebo"):
+        for loop in gazebo.findall("joint"):
+            ends = [_text(end) for tag in ("parent", "child") for end in loop.findall(tag)]
             frames = [
                 model.getFrameId(end, pin.FrameType.BODY)
                 for end in ends
@@ -194,38 +198,36 @@ def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
             ]
             if len(frames) == 2:
                 one, other = (int(model.frames[i].parentJoint) for i in frames)
-                text = (
-                    f"Gazebo's <joint> {loop.getAttribute('name')!r} closes a loop, and robots here are trees"
-                )
+                text = f"Gazebo's <joint> {loop.get('name', '')!r} closes a loop, and robots here are trees"
                 yield Tie(text=text, joints=between(model, one, other), free=0, fix="take it out")
 
 
-def _weightless(root: Any) -> Iterator[str]:
+def _weightless(root: Element) -> Iterator[str]:
     """Note on links with mass that have no gravity in Gazebo."""
-    heavy = {link.getAttribute("name") for link in _children(root, "link") if _children(link, "inertial")}
+    heavy = {link.get("name", "") for link in root.findall("link") if link.findall("inertial")}
     names = []
-    for gazebo in _children(root, "gazebo"):
-        off = [_text(tag) in ("false", "0") for tag in _children(gazebo, "gravity")]
-        off += [_text(tag) in ("true", "1") for tag in _children(gazebo, "turnGravityOff")]
-        if any(off) and gazebo.getAttribute("reference") in heavy:
-            names.append(gazebo.getAttribute("reference"))
+    for gazebo in root.findall("gazebo"):
+        off = [_text(tag) in ("false", "0") for tag in gazebo.findall("gravity")]
+        off += [_text(tag) in ("true", "1") for tag in gazebo.findall("turnGravityOff")]
+        if any(off) and gazebo.get("reference", "") in heavy:
+            names.append(gazebo.get("reference", ""))
     if names:
         yield f"links without gravity in Gazebo have their weight here: {_listed(names)}"
 
 
-def _rotors(root: Any) -> Iterator[str]:
+def _rotors(root: Element) -> Iterator[str]:
     """Note on rotor inertias in <transmission>, which are not read, as there are several dialects."""
     names = [
-        joint.getAttribute("name")
-        for transmission in _children(root, "transmission")
-        if any("inertia" in tag.tagName.lower() for tag in transmission.getElementsByTagName("*"))
-        for joint in _children(transmission, "joint")
+        joint.get("name", "")
+        for transmission in root.findall("transmission")
+        if any("inertia" in tag.tag.lower() for tag in transmission.iter())
+        for joint in transmission.findall("joint")
     ]
     if names:
         yield f"rotors' inertia in <transmission> is left out, of {_listed(names)}; give `armature`"
 
 
-def _check_links(root: Any, urdf: str, *, moments: bool) -> None:
+def _check_links(root: Element, urdf: str, *, moments: bool) -> None:
     """InputError with all links of a non-physical inertia.
 
     Pinocchio adds up links that are fixed to each other, and the sum may hide the mistake of one. Links
@@ -234,16 +236,16 @@ def _check_links(root: Any, urdf: str, *, moments: bool) -> None:
     moments : check the moments of inertia, too.
     """
     found = Mistakes()
-    for link in _children(root, "link"):
-        given = _children(link, "inertial")
-        masses = [mass for part in given for mass in _children(part, "mass")]
-        inertias = [inertia for part in given for inertia in _children(part, "inertia")]
+    for link in root.findall("link"):
+        given = link.findall("inertial")
+        masses = [mass for part in given for mass in part.findall("mass")]
+        inertias = [inertia for part in given for inertia in part.findall("inertia")]
         if not masses or not inertias:
             continue
         keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-        entries = [_urdf_number(inertias[0].getAttribute(key)) for key in keys]
-        m, (xx, yy, zz, xy, xz, yz) = _urdf_number(masses[0].getAttribute("value")), entries
-        where = f"URDF {urdf}: the <inertial> of link {link.getAttribute('name')!r}"
+        entries = [_urdf_number(inertias[0].get(key, "")) for key in keys]
+        m, (xx, yy, zz, xy, xz, yz) = _urdf_number(masses[0].get("value", "")), entries
+        where = f"URDF {urdf}: the <inertial> of link {link.get('name', '')!r}"
         numbers = np.array([m, *entries])
         if not np.isfinite(numbers).all() or m < 0 or np.abs(numbers).max() > HEAVIEST:
             found.found.append(
@@ -260,10 +262,6 @@ def _check_links(root: Any, urdf: str, *, moments: bool) -> None:
     found.raise_if_any(f"URDF {urdf}")
 
 
-def _children(element: Any, tag: str) -> list[Any]:
-    return [child for child in element.childNodes if getattr(child, "tagName", None) == tag]
-
-
 def _urdf_number(text: str) -> float:
     """A number of a URDF; 0 for text that is no number, as its parser has taken it before."""
     try:
@@ -276,11 +274,11 @@ def _listed(names: list[str]) -> str:
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
-def _text(element: Any) -> str:
+def _text(element: Element) -> str:
     """The attribute `link` of an element, which Gazebo's loops have, or else its text."""
-    words = "".join(child.data for child in element.childNodes if child.nodeType == child.TEXT_NODE)
-    return str(element.getAttribute("link") or words).strip()
+    words = [element.text, *(child.tail for child in element)]
+    return (element.get("link", "") or "".join(filter(None, words))).strip()
 
 
-def _numbers(element: Any, tag: str) -> list[float]:
-    return [_urdf_number(_text(child)) for child in _children(element, tag)]
+def _numbers(element: Element, tag: str) -> list[float]:
+    return [_urdf_number(_text(child)) for child in element.findall(tag)]

@@ -119,38 +119,47 @@ def drifting_reference(
     # a swing's end is given, not its start: there the striking point has to be at the target
     order = np.arange(len(time))[:: -1 if backward else 1]
     y, yd, ydd = (np.array(part) for part in sample(time)[:3])
-    no_legs, weight = np.zeros(0), np.append(np.array(model.gravity.linear), np.zeros(3))
+    weight = np.append(np.array(model.gravity.linear), np.zeros(3))
     weight *= sum(inertia.mass for inertia in model.inertias)  # (6,) wrench about the centre of mass
 
-    def velocity(y: Array, yd: Array, momentum: Array) -> Array:
-        """v (nv,) with the joints' rates, and the base's for this momentum (6,) about the centre of mass."""
-        q, v = c.join(y, no_legs), np.append(np.zeros(6), yd[6:])
+    def velocity(q: Array, base: Array, yd: Array, momentum: Array) -> Array:
+        """v (nv,) with the joints' rates, and the base's for this momentum (6,) about the centre of mass.
+
+        The base's coordinates (6,) are written to q (nq,), which has the joints'.
+        """
+        v = np.append(np.zeros(6), yd[6:])
+        q[:3], q[3:7] = base[:3], pin.Quaternion(pin.rpy.rpyToMatrix(base[3:6])).coeffs()
         pin.ccrba(model, data, q, v)  # data.Ag: momentum matrix (6, nv); data.hg: momentum at v
         v[:6] = solved(np.array(data.Ag[:, :6]), momentum - np.array(data.hg.vector))
         return v
 
+    def joined(y: Array) -> Array:
+        return c.join(y, np.zeros((len(y), 0)))
+
     start = order[0]
-    q, v, _ = c.complete_motion(y[start], yd[start], ydd[start], no_legs)
-    momentum = np.array(pin.computeCentroidalMomentum(model, data, q, v).vector)
+    q, v = joined(y), np.zeros((len(y), model.nv))
+    _, v[start], _ = c.complete_motion(y[start], yd[start], ydd[start], np.zeros(0))
+    momentum = np.array(pin.computeCentroidalMomentum(model, data, q[start], v[start]).vector)
     # classical Runge-Kutta method for the base's pose; the joints' motion is known at all its stages
     middles, middle_rates, _ = sample((time[1:] + time[:-1]) / 2)[:3]
+    between = joined(np.asarray(middles))
     for one, other in pairwise(order.tolist()):
-        h, between = time[other] - time[one], min(one, other)
-        base, slopes = y[one, :6], list[Array]()
-        for fraction, (joints, joint_rates) in (
-            (0.0, (y[one], yd[one])),
-            (0.5, (middles[between], middle_rates[between])),
-            (0.5, (middles[between], middle_rates[between])),
-            (1.0, (y[other], yd[other])),
+        h, middle = time[other] - time[one], min(one, other)
+        base, elapsed = y[one, :6], time[one] - time[start]
+        slopes = [base_rates(base, v[one])]
+        for fraction, joints, rates in (
+            (0.5, between[middle], middle_rates[middle]),
+            (0.5, between[middle], middle_rates[middle]),
+            (1.0, q[other], yd[other]),
         ):
-            stage = np.append(base + fraction * h * slopes[-1] if slopes else base, joints[6:])
-            elapsed = time[one] + fraction * h - time[start]
-            slopes.append(base_rates(stage, velocity(stage, joint_rates, momentum + elapsed * weight)))
+            stage = base + fraction * h * slopes[-1]
+            found = velocity(joints, stage, rates, momentum + (elapsed + fraction * h) * weight)
+            slopes.append(base_rates(stage, found))
         y[other, :6] = base + h / 6 * (slopes[0] + 2 * slopes[1] + 2 * slopes[2] + slopes[3])
-    q, v = c.join(y, np.zeros((len(y), 0))), np.zeros((len(y), model.nv))
+        v[other] = velocity(q[other], y[other, :6], yd[other], momentum + (elapsed + h) * weight)
+    q = joined(y)
     a, torque = np.zeros_like(v), np.zeros((len(y), robot.n))
     for k in range(len(y)):
-        v[k] = velocity(y[k], yd[k], momentum + (time[k] - time[start]) * weight)
         a[k, 6:] = ydd[k, 6:]
         # the equations of motion are linear in the base's acceleration: its six equations have no torque
         force = robot.inverse_dynamics(data, q[k], v[k], a[k])  # while a[k, :6] = 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -173,15 +173,24 @@ class Way:
 
     def at(self, s: float) -> Callable[[Variables], tuple[Array, Array, Array]]:
         """y, y', y'' at a fraction s, as a function of the variables."""
-        weights = [self._curve(s, order) for order in range(3)]
-        used = np.flatnonzero(np.abs(weights).max(axis=0))
+        derivatives = self._derivatives(s, range(3))
 
         def values(v: Variables) -> tuple[Array, Array, Array]:
-            points = np.array([self.control(v, int(j)) for j in used])
-            y, y1, y2 = (w[used] @ points for w in weights)
+            y, y1, y2 = derivatives(v)
             return y, y1, y2
 
         return values
+
+    def third(self, s: float) -> Callable[[Variables], Array]:
+        """y''' at a fraction s, as a function of the variables."""
+        derivatives = self._derivatives(s, [3])
+        return lambda v: derivatives(v)[0]
+
+    def _derivatives(self, s: float, orders: Sequence[int]) -> Callable[[Variables], list[Array]]:
+        """Derivatives of y by s, of few control points each."""
+        weights = np.array([self._curve(s, order) for order in orders])
+        used = np.flatnonzero(np.abs(weights).max(axis=0))
+        return lambda v: list(weights[:, used] @ np.array([self.control(v, int(j)) for j in used]))
 
     def wrench(self, v: Variables, k: int) -> Array:
         """Sole wrenches (6 a sole) at node k."""

@@ -182,11 +182,11 @@ def _with_base(
 ) -> tuple[Array, Array, Array]:
     """Planned y, rates and second rates with a record's base, which nothing holds: the joints move it."""
     y, u, slope = (part.copy() for part in planned)
-    y[:6], none = found[:6], np.zeros(0)
-    unit = [p.robot.motion(y, none, np.append(e, u[6:]), 0 * u)[1][:6] for e in np.eye(6)]
-    u[:6] = np.linalg.solve(np.transpose(unit), v[:6])
-    drift = p.robot.motion(y, none, u, np.append(np.zeros(6), slope[6:]))[2][:6]
-    slope[:6] = np.linalg.solve(np.transpose(unit), a[:6] - drift)
+    y[:6] = found[:6]
+    rates = p.robot.base_rates(y)
+    u[:6] = np.linalg.solve(rates, v[:6])
+    drift = p.robot.motion(y, np.zeros(0), u, np.append(np.zeros(6), slope[6:]))[2][:6]
+    slope[:6] = np.linalg.solve(rates, a[:6] - drift)
     return y, u, slope
 
 

@@ -119,12 +119,11 @@ class RobotMotion:
         q = self.posture(y, legs)
         v, a = np.zeros(model.nv), np.zeros(model.nv)
         if b:
-            turn = pin.rpy.rpyToMatrix(*y[3:6])
-            jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
+            rates = self.base_rates(y)
             bend = pin.rpy.computeRpyJacobianTimeDerivative(y[3:6], u[3:6], pin.LOCAL)
-            v[:3], v[3:6] = turn.T @ u[:3], jac @ u[3:6]
-            a[:3] = turn.T @ slope[:3] - pin.skew(v[3:6]) @ v[:3]
-            a[3:6] = jac @ slope[3:6] + bend @ u[3:6]
+            v[:6] = rates @ u[:6]
+            drift = np.concatenate([-pin.skew(v[3:6]) @ v[:3], bend @ u[3:6]])
+            a[:6] = rates @ slope[:6] + drift
         v[b + self.independent], a[b + self.independent] = u[b:], slope[b:]
         blocks = []
         if self.soles:
@@ -139,6 +138,13 @@ class RobotMotion:
             for (_, columns, block), drift in zip(blocks, found, strict=True):
                 a[columns] = np.linalg.solve(block, -drift)
         return q, v, a
+
+    def base_rates(self, y: Array) -> Array:
+        """(6, 6) the base's velocity, in its own axes, by the rates of its coordinates."""
+        out = np.zeros((6, 6))
+        out[:3, :3] = pin.rpy.rpyToMatrix(*y[3:6]).T
+        out[3:, 3:] = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
+        return out
 
     def closed_legs(self, y: Array, guess: Array) -> Array:
         """Leg joints (nl,) that put the soles where they are held, by Newton's method from a guess."""
@@ -309,8 +315,7 @@ class RobotMotion:
     def _upper(self, y: Array, u: Array) -> tuple[Array, Array, Array]:
         q, v = self.posture(y, np.zeros(self.nl)), np.zeros(self.model.nv)
         if self.base:
-            v[:3] = pin.rpy.rpyToMatrix(*y[3:6]).T @ u[:3]
-            v[3:6] = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL) @ u[3:6]
+            v[:6] = self.base_rates(y) @ u[:6]
         v[self.base + self.independent] = u[self.base :]
         return q, v, np.zeros(self.model.nv)
 

@@ -169,13 +169,10 @@ def price_pieces(problem: ImpactProblem, ways: Sequence[Way], blows: Sequence[Bl
 
             out.append(Piece(bending))
         for s, end in pairwise(way.breaks) if style.jerk else ():
-            middle, weight = (s + end) / 2, style.jerk * (end - s) / typical**5
+            weight, third = style.jerk * (end - s) / typical**5, way.third((s + end) / 2)
 
-            def jerking(
-                v: Variables, way: Way = way, middle: float = middle, weight: float = weight
-            ) -> Array:
-                third = way.curve(v)[2].derivative()(middle)
-                return np.array([weight * np.sum(third**2)])
+            def jerking(v: Variables, third: Any = third, weight: float = weight) -> Array:
+                return np.array([weight * np.sum(third(v) ** 2)])
 
             out.append(Piece(jerking))
         if way.rests:

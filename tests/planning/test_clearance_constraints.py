@@ -106,12 +106,19 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
     assert looked > 3
 
 
-def test_rounds_end_with_bodies_that_are_apart(free: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("interval", "warm"), [(9, True), (10, False)], ids=["warm", "from its solution"])
+def test_rounds_end_with_bodies_that_are_apart(
+    free: Solution, interval: int, warm: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A peg that the hammer meets only between two nodes, near the nail: no round begins where all its rows
     are met already.
+
+    warm : the solutions' multipliers lead to the next one; else these guesses fail, and others follow.
     """
-    nodes = free.plan.swing_nodes * free.plan.swing.duration
-    x, _, z = hammer(free, (nodes[10] + nodes[11]) / 2)
+    if not warm:
+        monkeypatch.setattr(between_nodes, "_ITERATIONS_WARM", 5)
+    first, last = free.plan.swing_nodes[interval : interval + 2] * free.plan.swing.duration
+    x, _, z = hammer(free, 0.35 * first + 0.65 * last)
     problem, began, solved = with_peg(free.problem, x, z), list[float](), between_nodes.solve_with_clearance
 
     def watched(budget: Budget, margins: Margins, guess: Guess[Transcription]) -> Outcome[Transcription]:

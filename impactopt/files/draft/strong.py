@@ -177,10 +177,13 @@ def strike_problem(
                 start=start,
                 **given,
             )
-            clear = not touches(problem, start, impact.q) and not _hits_base(problem, impact)
+            if touches(problem, start, impact.q):
+                continue
+            if _hits_base(problem, impact):
+                return None  # whatever the start
         except InputError:
             continue
-        if clear and not hopeless(problem):
+        if not hopeless(problem):
             return problem
     return None
 

@@ -5,9 +5,9 @@ parameter values that a relaxed solution needs.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,7 @@ _NO_INDICES = np.zeros(0, dtype=np.intp)
 _RESERVE = 0.02
 # [m] Shift of a clearance that costs as much in the relaxation as a shift of another bound by its own size.
 _CLEARANCE_UNIT = 0.1
+_MAX_PAIRS = 3  # of bodies that a cause names
 _MAX_PROBES = 6  # evaluations of the program for the value of a term's parameter
 # Terms whose constraints have names of their own. The others' names begin with the term's.
 _TERM_OF: dict[str, type[Term]] = {
@@ -75,12 +76,24 @@ class Cause:
         return f"{self.kind}: {self.text}"
 
 
+class Pair(NamedTuple):
+    """Pair of bodies with clearance constraints: their names, and the term of the constraints."""
+
+    names: str
+    term: type[KeepOut | SelfCollision]
+
+    def select(self, constraint: ConstraintOrigin) -> bool:
+        """True for a constraint of this pair."""
+        return constraint.term == self.term.name and constraint.component == self.names
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bound:
     """Bounds of a program that come from one parameter of its problem.
 
     select : picks the constraints that it bounds.  variables : indices of those that it bounds.  unit : as of
     a `Relaxation`.  causes : by variables (n,) that meet all other bounds, the values that it would need.
+    pair : of bodies whose clearance it is; None: it is no clearance.
     """
 
     name: str
@@ -89,6 +102,7 @@ class Bound:
     unit: float
     causes: Callable[[Array], Iterable[Cause]]
     is_time: bool = False
+    pair: Pair | None = None
 
     def relaxation(self, t: Transcription) -> Relaxation:
         """Relaxation of this bound in any program with the same variables."""
@@ -184,32 +198,44 @@ def _duration_cause(
 
 def _clearances(t: Transcription) -> Iterator[Bound]:
     """Clearance of each pair of bodies that has constraints."""
-    kinds = KeepOut.name, SelfCollision.name
-    for term, pair in dict.fromkeys((r.term, r.component) for r in t.program.origins if r.term in kinds):
+    kinds = {kind.name: kind for kind in (KeepOut, SelfCollision)}
+    for term, names in dict.fromkeys((r.term, r.component) for r in t.program.origins if r.term in kinds):
+        pair = Pair(names, kinds[term])
 
-        def select(constraint: ConstraintOrigin, term: str = term, pair: str = pair) -> bool:
-            return constraint.term == term and constraint.component == pair
-
-        def causes(
-            x: Array, select: Selector = select, term: str = term, pair: str = pair
-        ) -> Iterator[Cause]:
-            missing = 1e3 * _violation(t, x, select)
-            # Pairs have no parameter of their own: the problem that shows the cause
-            # is the one without the term.
-            free = (KeepOut if term == KeepOut.name else SelfCollision)(enabled=False)
-            yield Cause(
-                kind="the floor" if "ground" in pair.split(" and ")[1:] else term,
-                text=f"{pair}: {missing:.2g} mm nearer than allowed",
-                problem=changed_or_none(t.problem, terms=with_term(t.problem, free)),
-            )
+        def causes(x: Array, pair: Pair = pair) -> Iterator[Cause]:
+            yield clearance_cause(t, x, [pair])
 
         yield Bound(
-            name=f"{term}, {pair}",
-            select=select,
+            name=f"{term}, {names}",
+            select=pair.select,
             variables=_NO_INDICES,
             unit=_CLEARANCE_UNIT,
             causes=causes,
+            pair=pair,
         )
+
+
+def clearance_cause(t: Transcription, x: Array, pairs: Sequence[Pair]) -> Cause:
+    """Cause that bodies come too near to each other, at variables (n,) that meet all other bounds.
+
+    The text names the pairs that miss most of their clearance.
+    """
+    missing = [(_violation(t, x, pair.select), pair) for pair in pairs]
+    missing.sort(key=lambda one: -one[0])
+    near = [(by, pair) for by, pair in missing if by > FEASIBLE] or missing[:1]
+    terms = {pair.term for _, pair in near}
+    on_ground = all("ground" in pair.names.split(" and ")[1:] for _, pair in near)
+    problem: ImpactProblem | None = t.problem
+    # Pairs have no parameter of their own: the problem that shows the cause is the one without the terms.
+    for term in terms:
+        problem = problem and changed_or_none(problem, terms=with_term(problem, term(enabled=False)))
+    return Cause(
+        kind="the floor" if on_ground else " and ".join(sorted(term.name for term in terms)),
+        text=", and ".join(
+            f"{pair.names}: {1e3 * by:.2g} mm nearer than allowed" for by, pair in near[:_MAX_PAIRS]
+        ),
+        problem=problem,
+    )
 
 
 def _terms(t: Transcription) -> Iterator[Bound]:

@@ -24,6 +24,7 @@ from impactopt.planning.bounds import (
     Cause,
     bounds_of,
     changed_or_none,
+    clearance_cause,
     motion_phases,
     phase_changes,
 )
@@ -136,6 +137,8 @@ class _CauseSearch:
             if alone is not None:
                 causes += filter(None, map(self._confirmed, bound.causes(alone[0])))
         if not any(cause.problem for cause in causes):
+            causes += self._clearances(candidates, x)
+        if not any(cause.problem for cause in causes):
             causes += self._stiffness()
         # Stable: those that would do come first, in the order found.
         causes.sort(key=lambda cause: cause.problem is None)
@@ -170,6 +173,14 @@ class _CauseSearch:
                 return replace(one, nearer=None)
         return replace(cause, nearer=None) if cause.problem is None else None
 
+    def _clearances(self, candidates: Sequence[Bound], guess: Array) -> Iterator[Cause]:
+        """Clearances that only together make the problem feasible, from variables (n,) with all relaxed."""
+        bounds = [bound for bound in candidates if bound.pair is not None]
+        found = self._relaxed(bounds, guess, _ITERATIONS_SINGLE) if len(bounds) > 1 else None
+        if found is not None:
+            pairs = [bound.pair for bound in bounds if bound.pair is not None]
+            yield from filter(None, [self._confirmed(clearance_cause(self.t, found[0], pairs))])
+
     def _stiffness(self) -> Iterator[Cause]:
         """The first contact stiffness with a solution, among multiples of the problem's: no bound of the
         program contains it.
@@ -200,7 +211,10 @@ class _CauseSearch:
 
     def _solution(self, problem: ImpactProblem, most: int) -> tuple[Transcription, Array] | None:
         """Program and solution (n,) of a problem from its initial guess; None if there is none."""
-        t = program_for(self.t, problem)
+        # without the clearances of a term that is turned off to show that it is the cause
+        terms = problem.self_collision, problem.keep_out
+        known = {k: v for k, v in self.t.clearance_constraints.items() if terms[k.other < 0].enabled}
+        t = program_for(self.t, problem, constraints=known)
         result = self._run(t.program, first_iterate(t), most)
         return None if result is None else (t, result.x)
 

@@ -722,7 +722,8 @@ def test_numbers_that_the_file_has_are_not_guessed(tmp_path: Path) -> None:
 
 def test_bad_inertias_are_listed_and_their_repair_has_to_be_said(tmp_path: Path) -> None:
     draft = _drafted(tmp_path, urdfs.biped(moments=FLAT))
-    assert "'right_elbow'" in draft.text and any("1 inertia is not physical" in line for line in draft.said)
+    (told,) = (line for line in draft.said if "1 inertia is not physical" in line)
+    assert "'right_elbow'" in draft.text and ": correct it, or" in told
     file = tmp_path / "robot.toml"
     file.write_text(draft.text)
     with pytest.raises(InputError, match="'right_elbow'"):

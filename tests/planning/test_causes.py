@@ -77,6 +77,18 @@ def test_no_cause_is_confirmed_by_a_motion_through_an_obstacle(arm: ImpactProble
     assert not searched(blocked)[2].causes
 
 
+def test_clearances_that_are_too_many_together_are_named(arm: ImpactProblem) -> None:
+    """A shelf of several boxes at the hit point: without one of them alone there is no motion."""
+    low = [dataclasses.replace(phase, intervals=6) for phase in (arm.swing, arm.follow)]
+    shelf = Obstacle(name="shelf", size=(0.3, 0.3, 0.1), position=(0.7, 0.0, 0.8))
+    blocked = dataclasses.replace(arm, swing=low[0], follow=low[1], obstacles=(shelf,))
+    t, result, found = searched(blocked, near=True)
+    (cause,) = found.causes
+    assert cause.kind == "keep out"
+    assert cause.text.count("wrist and shelf") == 2 and cause.text.count("mm nearer than allowed") == 2
+    assert with_reason(t, result, found.causes).message.startswith("Infeasible: keep out. wrist and shelf")
+
+
 def test_no_less_would_do(arm: ImpactProblem) -> None:
     """The swing of the message is the shortest there is, within a few per cent."""
     problem = load_problem("punch_infeasible")

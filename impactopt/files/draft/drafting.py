@@ -647,8 +647,9 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
     if len(drafted.drives.said) > 3:
         yield f"... and {counted(len(drafted.drives.said) - 3, 'more such number')}: see the file's head"
     if drafted.wrong:
+        them = "it" if len(drafted.wrong) == 1 else "them"
         yield (
-            f"{_wrong(drafted)}, listed at the file's head: correct them, or "
+            f"{_wrong(drafted)}, listed at the file's head: correct {them}, or "
             'set `inertias = "repaired"` there'
         )
 

@@ -87,6 +87,11 @@ def export(
             typer.echo(printable(str(path)))
         if cost is not None:
             meets = f"; it meets other bodies {cost['touches']} times" if cost["touches"] else ""
+            if cost["pressing_ms"]:
+                meets = (
+                    f", and presses on the target for {cost['pressing_ms']:.0f} ms after the impact, with "
+                    f"{cost['pressing_Ns']:.3g} N s{meets}"
+                )
             change = 100 * (cost["impulse_Ns"] / cost["planned_impulse_Ns"] - 1)
             typer.echo(
                 f"smoothed: {cost['impulse_Ns']:.3g} N s in our replay, {abs(change):.1f} % "

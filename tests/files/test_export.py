@@ -275,6 +275,7 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
     told = json.loads(meta.read_text())["smooth"]
     assert told["impulse_Ns"] == pytest.approx(replayed(arm.problem, read).impulse, rel=2 * NEAR)
     assert told["impulse_Ns"] == pytest.approx(arm.impulse, rel=0.05)
+    assert told["pressing_Ns"] == told["pressing_ms"] == 0
     with pytest.raises(InputError, match="bolted robots"):
         still.export("csv", tmp_path / "legs", smooth=limits)
     with pytest.raises(InputError, match="does not hit the target; the plan's swing has up to") as slow:

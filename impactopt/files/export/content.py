@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.integrate import trapezoid
 
 from impactopt import __version__
 from impactopt.contact.fields import abouts
@@ -30,7 +31,7 @@ from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation import simulate
-from impactopt.simulation.result import parts_from
+from impactopt.simulation.result import MAX_GAP, parts_from
 from impactopt.solvers.program import Status
 from impactopt.transcription.plan import Trajectory
 
@@ -117,7 +118,7 @@ class Export:
 
     planned : the plan, its problem and its references.  joints : names, in the order of all columns.
     order (n,) : indices of these in the robot's own arrays.  rate [Hz].  gravity : effort includes it.
-    smooth : limits of a smoothed motion and its impulse in a replay; None: it is not smoothed.
+    smooth : limits of a smoothed motion and its impulses in a replay; None: it is not smoothed.
     motion : as planned, or smoothed.
     missed : the motion if nothing is hit, on the same time axis; None for a plan without an abort motion.
         From contact on both coast, `motion` until its contact ends, `missed` until the abort motion begins.
@@ -247,7 +248,7 @@ def export_of(
     Raises
     ------
     InputError : the plan is not solved; joints that are no permutation of the robot's; a rate out of range;
-        a robot on soles without gravity, or smoothed; limits that no motion satisfies.
+        a robot on soles without gravity, or smoothed; limits that no motion satisfies, or none that hits.
     """
     robot = planned.problem.robot
     order = check_export(planned.record.summary.get("status"), robot, rate, joints)
@@ -272,11 +273,14 @@ def export_of(
 
 def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, dict[str, float]]:
     """The plan with a smoothed reference and without its abort motion, which would begin with a jump; limits
-    and impulse of the smoothed motion in a replay.
+    and impulses of the smoothed motion in a replay.
+
+    A motion that cannot brake at contact has its reference behind the target, and presses on it after the
+    impact. That impulse is `pressing_Ns`; `pressing_ms` is the time from the impact to the last contact.
 
     Raises
     ------
-    InputError : no motion satisfies the limits, or it does not hit the target.
+    InputError : no motion satisfies the limits; it does not hit the target, or presses more than it hits.
     """
     within = Smoothness(acceleration=limits[0], jerk=limits[1])
     reference = smoothed(planned.reference, planned.problem, within)
@@ -291,11 +295,25 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
             f"does not hit the target; the plan's swing has up to {most:g} rad/s^2 and {fastest:g} rad/s^3: "
             "give larger limits, or plan with [terms.joint_acceleration]"
         )
+    touches = np.array(replayed.touches)
+    impact_end = touches[0, 0] + reference.contact_end - reference.contact_start + MAX_GAP
+    time, force = replayed.contact_time, replayed.contact_force
+    pressing = float(trapezoid(np.where(time > impact_end, force, 0.0), time))
+    impulse = replayed.impulse - pressing
+    if pressing > impulse:
+        raise InputError(
+            f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "
+            f"brakes too late: it gives the target {impulse:.3g} N s in the impact, and then presses on it "
+            f"with {pressing:.3g} N s, until {touches[-1, 1] - touches[0, 0]:.2g} s after the first touch; give "
+            "larger limits, or plan with a smaller fraction in [terms.velocity_limit]"
+        )
     smoothing = {
         "acceleration_rad_s2": within.acceleration,
         "jerk_rad_s3": within.jerk,
-        "impulse_Ns": replayed.impulse,
+        "impulse_Ns": impulse,
         "planned_impulse_Ns": float(planned.record.summary["impulse_Ns"]),
+        "pressing_Ns": pressing,
+        "pressing_ms": 1e3 * max(float(touches[-1, 1] - impact_end), 0.0),
         "touches": len(replayed.touched),
     }
     return dataclasses.replace(planned, reference=reference, missed=None), smoothing

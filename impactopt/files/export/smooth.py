@@ -135,23 +135,27 @@ def _joint(
     at_rest = [np.where(ends, 0.0, most) for most in (fastest, limits.acceleration)]
     upper = [np.where(ends, position, highest), *at_rest, np.full(k, limits.jerk)]
     lower = [np.where(ends, position, lowest), *(-x for x in upper[1:])]
+    # In units that make all numbers of order one, and not by the simplex method, which failed on some programs
+    # of any units.
+    sizes = np.array([POSITION_TIME, 1.0, limits.acceleration, limits.jerk])
+    column = np.repeat([*sizes, *sizes[:2]], k)
+    equation, inequality = np.repeat(sizes[:3], k - 1), np.repeat(sizes[:2], 2 * k)
+    bounds = np.stack([[*lower, *np.zeros((2, k))], [*upper, *np.full((2, k), np.inf)]])
     found = linprog(
-        np.concatenate([np.zeros(4 * k), weight / POSITION_TIME, weight]),
-        A_ub=deviations,
-        b_ub=np.concatenate([position, -position, velocity, -velocity]),
-        A_eq=integration,
+        np.concatenate([np.zeros(4 * k), weight, weight]),
+        A_ub=sp.diags(1 / inequality) @ deviations @ sp.diags(column),
+        b_ub=np.concatenate([position, -position, velocity, -velocity]) / inequality,
+        A_eq=sp.diags(1 / equation) @ integration @ sp.diags(column),
         b_eq=np.zeros(3 * (k - 1)),
-        bounds=np.column_stack(
-            [np.concatenate([*lower, np.zeros(2 * k)]), np.concatenate([*upper, np.full(2 * k, np.inf)])]
-        ),
-        method="highs-ds",
+        bounds=(bounds.reshape(2, -1) / column).T,
+        method="highs-ipm",
     )
     if found.status != 0:
         raise InputError(
             f"smooth: no motion of {name} with at most {limits.acceleration:g} rad/s^2 and {limits.jerk:g} "
             "rad/s^3 ends where the plan does; give larger limits, or plan a longer follow-through"
         )
-    q, v, a = found.x[: 3 * k].reshape(3, k)
+    q, v, a = (column * found.x)[: 3 * k].reshape(3, k)
     return q, v, a
 
 

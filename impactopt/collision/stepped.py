@@ -252,6 +252,20 @@ class SteppedModel(CollisionModel):
                 f"armature{more}"
             )
 
+    def check_grips(self, v: NDArray[np.float64] | None = None) -> None:
+        """InputError if a soft grip moves at contact at v (..., nv); None: an input, so it may move.
+
+        The reference of all joints coasts in these models, but a spring's angle of rest does not move.
+        """
+        grips = self.robot.sprung & bool(self.n_servos and self.effects.stiffness)
+        if not grips.any() or (v is not None and not v[..., -self.robot.n :][..., grips].any()):
+            return
+        names = ", ".join(np.array(self.robot.joint_names)[grips])
+        raise InputError(
+            f"{names}: {type(self).__name__} has no spring of a soft grip that moves at contact, only a "
+            "servo whose reference moves with it: take FullDynamics ([at_contact] model, or --model: 'full')"
+        )
+
     @cached_property
     def available(self) -> tuple[str, ...]:
         """Names of the outputs that this model has, out of `impactopt.collision.OUTPUTS`."""

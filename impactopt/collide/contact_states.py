@@ -44,8 +44,7 @@ def striking_functions(robot: Robot, *, striker: str, stance: Stance) -> dict[st
       v = B x has the least kinetic energy of all that give the striking point the velocity G x.
     * ``least_rates``: likewise with the sum of squares of the joint velocities over their limits in the
       place of the kinetic energy.
-    * ``holding`` ((q, v), -) -> tau (n) [N m]: torque for zero acceleration; torque and constraint wrenches
-      together have the least norm.
+    * ``holding`` ((q, v), -) -> tau (n) [N m]: as of `holding_torque`.
 
     The second input of each is empty. Outputs are joined in one vector, matrices by columns.
     """
@@ -55,7 +54,8 @@ def striking_functions(robot: Robot, *, striker: str, stance: Stance) -> dict[st
         tree = _StrikingGraphs(robot, held, frame)
         return [tree.least_energy(), tree.least_rates(), tree.holding()]
 
-    recipe = (model_hash(robot.model, robot.springs), frame, held, robot.velocity_limit)
+    hinges = np.flatnonzero(robot.hinges).tolist()
+    recipe = (model_hash(robot.model, robot.springs), frame, held, robot.velocity_limit, hinges)
     return cached("striking", recipe, build)
 
 
@@ -64,7 +64,10 @@ class _StrikingGraphs:
 
     def __init__(self, robot: Robot, held: tuple[str, ...], frame: str) -> None:
         self.rb = RigidBody(robot.model, springs=robot.springs)
-        self.n, self.base = robot.n, robot.nv - robot.n
+        self.base = robot.nv - robot.n
+        hinges = self.base + np.flatnonzero(robot.hinges)
+        self.undriven = [*range(self.base), *hinges.tolist()]
+        self.driven = np.setdiff1d(np.arange(robot.nv), self.undriven).tolist()
         self.nq, self.nv, self.held, self.frame = robot.nq, robot.nv, held, frame
         self.velocity_scale = np.concatenate([np.full(self.base, _BASE_VELOCITY_SCALE), robot.velocity_limit])
 
@@ -99,19 +102,28 @@ class _StrikingGraphs:
         rb = self.rb
         bias = ca.Function("bias", [rb.q, rb.v], [rb.rnea(rb.v, None), self._held])
         b, J_c = bias(state[: self.nq], state[self.nq :])
-        of_base, of_joints = b[: self.base, :], b[self.base :, :]
-        if not self.held:
-            return ca.Function("holding", [state, none], [_column(of_joints)])
-        J_b, J_j = J_c[:, : self.base], J_c[:, self.base :]
-        # least |tau|^2 + |w|^2 with J_b' w = b_base and tau = b_joints - J_j' w, by the normal equations in w
-        # with the matrix I + J_j J_j', and a Schur complement for the base's equations
-        R = _inverse_of_cholesky(J_c.size1())(ca.DM.eye(J_c.size1()) + ca.mtimes(J_j, J_j.T))
-        y, U = ca.mtimes(R, ca.mtimes(J_j, of_joints)), ca.mtimes(R, J_b)
-        if self.base:
-            S = _inverse_of_cholesky(self.base)(ca.mtimes(U.T, U))
-            y = y + ca.mtimes(U, ca.mtimes(S.T, ca.mtimes(S, of_base - ca.mtimes(U.T, y))))
-        torque = of_joints - ca.mtimes(J_j.T, ca.mtimes(R.T, y))
-        return ca.Function("holding", [state, none], [_column(torque)])
+        of_undriven, of_driven = b[self.undriven], b[self.driven]
+        if self.held:
+            J_u, J_d = J_c[:, self.undriven], J_c[:, self.driven]
+            # least |tau|^2 + |w|^2 with J_u' w = b_undriven and tau = b_driven - J_d' w, by the normal
+            # equations in w with the matrix I + J_d J_d', and a Schur complement for the undriven equations
+            R = _inverse_of_cholesky(J_c.size1())(ca.DM.eye(J_c.size1()) + ca.mtimes(J_d, J_d.T))
+            y, U = ca.mtimes(R, ca.mtimes(J_d, of_driven)), ca.mtimes(R, J_u)
+            if self.undriven:
+                S = _inverse_of_cholesky(len(self.undriven))(ca.mtimes(U.T, U))
+                y = y + ca.mtimes(U, ca.mtimes(S.T, ca.mtimes(S, of_undriven - ca.mtimes(U.T, y))))
+            driven = of_driven - ca.mtimes(J_d.T, ca.mtimes(R.T, y))
+        elif self.undriven:
+            # nothing is fixed: H_uu a_u + b_u = 0, and tau = H_du a_u + b_driven
+            H = ca.Function("inertia", [rb.q], [ca.densify(rb.mass_matrix())])(state[: self.nq])
+            S = _inverse_of_cholesky(len(self.undriven))(H[self.undriven, self.undriven])
+            acceleration = -ca.mtimes(S.T, ca.mtimes(S, of_undriven))
+            driven = of_driven + ca.mtimes(H[self.driven, self.undriven], acceleration)
+        else:
+            driven = of_driven
+        torque = ca.MX.zeros(self.nv)
+        torque[self.driven] = driven
+        return ca.Function("holding", [state, none], [_column(torque[self.base :])])
 
     @property
     def _held(self) -> Any:

@@ -42,7 +42,7 @@ class AtContact(Section):
     posture of the robot by name, with the target at its hand. `joints` are added to it. The striking point
     moves along the normal at `speed`: a result's velocity is scaled; a posture gets the `velocity` of least
     kinetic energy, or that of the least sum of squares of joint velocities over their limits. The
-    feed-forward torque gives zero acceleration. Scales multiply the robot's gains and torque limits.
+    feed-forward torque keeps the joint velocities. Scales multiply the robot's gains and torque limits.
     """
 
     posture: str = "reach"

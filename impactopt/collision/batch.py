@@ -238,6 +238,7 @@ def _inputs(
     if not count:
         raise InputError("q: no collision; give at least one, (N, nq)")
     given["v"] = check_array("v", v, (count, robot.nv))
+    model.check_grips(given["v"])
     for _, part in unit_parts(robot.model):
         worst = int(np.abs(np.linalg.norm(given["q"][:, part], axis=1) - 1).argmax())
         robot.check_configuration(given["q"][worst], name=f"q of collision {worst}")

@@ -276,8 +276,8 @@ class Law:
             )
             f, k, d = (float(value) for value in found.ravel())
             return f, k, d
-        f_0, k, d = (float(value) for value in self._linear[:, int(compressing)])
-        return f_0 + k * x + d * rate, k, d
+        k, d = (float(value) for value in self._linear[:, int(compressing)])
+        return k * x + d * rate, k, d
 
     def separation(self, x: float, rate: float) -> float:
         """Function that is positive while contact lasts in restitution."""

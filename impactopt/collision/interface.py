@@ -118,7 +118,8 @@ class CollisionModel(ABC):
 
     The servo follows a reference that continues at the joint velocity at contact, unless the setting
     `reference` gives another one. With constant joint velocities, moving legs would not keep their soles in
-    place. A plan's reference does; `impactopt.coasting_reference` gives it.
+    place. A plan's reference does; `impactopt.coasting_reference` gives it. The spring of a soft grip has a
+    fixed angle of rest, and its torque at contact is in the feed-forward; `SDC` refuses a grip that moves.
 
     Attributes
     ----------

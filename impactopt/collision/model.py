@@ -17,7 +17,7 @@ relative to it: du/dt = A tau - s f + d - phiddot_ref.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -348,6 +348,7 @@ class Segment:
     final : state at its end.
     states : (n_states, k) recorded states, or None.
     v_after, q_after : velocity and configuration at its end; functions, as not all segments need them.
+    contact : 1 if it begins in contact, else 0.
     """
 
     data: dict[str, Any]
@@ -357,6 +358,7 @@ class Segment:
     v_after: Callable[[], Any]
     q_after: Callable[[], Any]
     tangential: Any = None
+    contact: Any = 1.0
 
 
 def relative_to(settings: Mapping[str, Any], time: Any, data: dict[str, Any]) -> dict[str, Any]:
@@ -463,7 +465,8 @@ class SegmentedCollision:
             length = self.horizon - duration * a if last else duration * (b - a)
             data["until"] = ca.if_else(contact, length, -1.0)
             begin = (start, 1.0 if last else b - a, duration * a)
-            segments.append(self._segment(data, frozen_at, q, v, *begin, record=record, tangential=before))
+            segment = self._segment(data, frozen_at, q, v, *begin, record=record, tangential=before)
+            segments.append(replace(segment, contact=contact))
             reached = segments[-1].final
             start = self._next_start(reached)
             # once separated, always: bodies that meet again are not in this model

@@ -106,7 +106,13 @@ class Outputs:
         # side
         if name not in HISTORIES:
             raise AttributeError(name)
-        history = ca.horzcat(*[getattr(instants, name) for instants in self._instants])
+        parts: list[Any] = []
+        for segment, instants in zip(self._segments, self._instants, strict=True):
+            own = getattr(instants, name)
+            if parts:  # after separation, with another freeze, repeat the instant of separation
+                own = ca.if_else(segment.contact, own, ca.repmat(parts[-1][:, -1], 1, own.size2()))
+            parts.append(own)
+        history = ca.horzcat(*parts)
         return history.T if history.size1() == 1 else history
 
     def _sum(self, part: str) -> Any:

@@ -57,7 +57,8 @@ class SDC(SymbolicModel):
     Raises
     ------
     InputError : as `SymbolicModel`; effects.friction without `friction`, or vice versa; freezes that are not
-        a whole number >= 0; an accuracy that is not positive.
+        a whole number >= 0; an accuracy that is not positive. With effects.stiffness, in `collide` and
+        `batch`: a soft grip that moves at contact; in `function`, `graph` and derivatives: any soft grip.
     """
 
     friction: JointFriction | None = None

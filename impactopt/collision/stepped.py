@@ -22,12 +22,17 @@ from impactopt.errors import InputError, check_array, check_choice, check_positi
 
 
 def law_is_linear(law: ContactLaw) -> bool:
-    """True if both branches are linear for all values of the law's parameters; a kink counts as nonlinear."""
+    """True if both branches are linear for all values of the law's parameters; a kink counts as nonlinear.
+
+    So does a force that is not zero where contact begins, as it is cut below zero.
+    """
     parameters, branches = _law_parts(law)
-    slopes = ca.horzcat(*[ca.jacobian(f, x) for f, x in branches])
-    found = [_sampled(parameters, law.parameters, slopes, branches[0][1], k) for k in range(_PARAMETER_SETS)]
+    x = branches[0][1]
+    start = [ca.substitute(f, x, ca.SX.zeros(2)) for f, _ in branches]
+    parts = ca.vertcat(*start, *[ca.jacobian(f, x).T for f, _ in branches])
+    found = [_sampled(parameters, law.parameters, parts, x, k) for k in range(_PARAMETER_SETS)]
     # Exactly equal: the slopes of a linear law are expressions without penetration and rate.
-    return all((values == values[0]).all() for values in found)
+    return all((values == values[0]).all() and not values[:, :2].any() for values in found)
 
 
 def target_is_linear(target: Target) -> bool:
@@ -64,7 +69,7 @@ def contact_functions(law: ContactLaw, target: Target) -> list[Any]:
 
     For a linear law
 
-        law_slopes (law) -> f_0, k, d of f = f_0 + k x + d dx/dt (3, 2): in restitution, in compression
+        law_slopes (law) -> k, d of f = k x + d dx/dt (2, 2): in restitution, in compression
 
     and for a nonlinear one, each value followed by its derivatives by penetration and rate (3):
 
@@ -101,10 +106,8 @@ def contact_functions(law: ContactLaw, target: Target) -> list[Any]:
 def _law_functions(law: ContactLaw) -> list[Any]:
     numbers, ((restitution, at), (compression, _)) = _law_parts(law)
     if law_is_linear(law):
-        columns = []
-        for f in (restitution, compression):
-            start = ca.substitute(f, at, ca.SX.zeros(2))
-            columns.append(ca.vertcat(start, ca.substitute(ca.jacobian(f, at), at, ca.SX.zeros(2)).T))
+        slopes = [ca.jacobian(f, at) for f in (restitution, compression)]
+        columns = [ca.substitute(slope, at, ca.SX.zeros(2)).T for slope in slopes]
         return [ca.Function("law_slopes", [numbers], [ca.densify(ca.horzcat(*columns))])]
     x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
     p = dict(zip(law.parameters, ca.vertsplit(numbers), strict=True))
@@ -251,6 +254,20 @@ class SteppedModel(CollisionModel):
                 f"{longest:.2g}: give {type(self).__name__} a step below that, or the joints less kd or more "
                 f"armature{more}"
             )
+
+    def check_grips(self, v: NDArray[np.float64] | None = None) -> None:
+        """InputError if a soft grip moves at contact at v (..., nv); None: an input, so it may move.
+
+        The reference of all joints coasts in these models, but a spring's angle of rest does not move.
+        """
+        grips = self.robot.sprung & bool(self.n_servos and self.effects.stiffness)
+        if not grips.any() or (v is not None and not v[..., -self.robot.n :][..., grips].any()):
+            return
+        names = ", ".join(np.array(self.robot.joint_names)[grips])
+        raise InputError(
+            f"{names}: {type(self).__name__} has no spring of a soft grip that moves at contact, only a "
+            "servo whose reference moves with it: take FullDynamics ([at_contact] model, or --model: 'full')"
+        )
 
     @cached_property
     def available(self) -> tuple[str, ...]:

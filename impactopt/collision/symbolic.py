@@ -50,6 +50,7 @@ class SymbolicModel(SteppedModel):
         InputError : the model has further freezes.
         """
         self._check_outputs(outputs, every)
+        self.check_grips()
         if self.n_freezes:
             raise InputError(
                 "graph: the times of further freezes depend on the contact's duration, which has no "
@@ -273,6 +274,7 @@ class SymbolicModel(SteppedModel):
         return self._functions[key]
 
     def _check_parameters(self, parameters: tuple[str, ...]) -> None:
+        self.check_grips()
         for name in parameters:
             # refuses an unknown name
             self.settings.override({name: self.settings.get(name, 0.0)})
@@ -318,6 +320,7 @@ class SymbolicModel(SteppedModel):
         **overrides: ArrayLike,
     ) -> Collision:
         q, v = self.robot.check_configuration(q), self.robot.check_velocity(v)
+        self.check_grips(v)
         values = self.settings.override(overrides)
         arguments: list[Any] = [q, v]
         if self.effects.feedforward and torque is None:

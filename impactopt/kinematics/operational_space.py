@@ -141,9 +141,10 @@ def striking_velocity(
 def holding_torque(
     robot: Robot, q: ArrayLike, v: ArrayLike | None = None, *, stance: Stance | None = None
 ) -> Array:
-    """Torque (n,) [N m] at which the robot does not accelerate, on a stance.
+    """Torque (n,) [N m] at which the driven joints do not accelerate, on a stance; hinges of soles have none.
 
     The least-norm solution (tau, lambda) of S' tau + J_c' lambda = c + g at q (nq,), v (nv,; None: at rest).
+    If nothing is fixed, the base accelerates: S' tau = H a + c + g, with a of the base alone.
 
     Raises
     ------
@@ -155,10 +156,17 @@ def holding_torque(
     bias = robot.nonlinear_effects(robot.model.createData(), q, v)
     if not np.all(np.isfinite(bias)):
         raise InputError("q, v: the forces of this motion are no finite numbers; give smaller ones")
-    held = _jacobians(robot.model, q, held_by.constraint_frames(robot))
-    # Columns S' and J_c': joints' torques, and the wrenches of fixed frames.
-    columns = np.hstack([np.eye(robot.nv)[:, -robot.n :], held.T])
-    return np.array(np.linalg.lstsq(columns, bias, rcond=None)[0][: robot.n])
+    frames = held_by.constraint_frames(robot)
+    driven = np.append(np.zeros(robot.nv - robot.n, dtype=bool), ~robot.hinges)
+    # Columns S' and J_c', or -H: driven joints' torques, and wrenches of fixed frames or accelerations.
+    if frames:
+        others = _jacobians(robot.model, q, frames).T
+    else:
+        others = -mass_matrix(robot.model, robot.model.createData(), q)[:, ~driven]
+    columns = np.hstack([np.eye(robot.nv)[:, driven], others])
+    torque = np.zeros(robot.n)
+    torque[~robot.hinges] = np.linalg.lstsq(columns, bias, rcond=None)[0][: driven.sum()]
+    return torque
 
 
 def _jacobians(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:

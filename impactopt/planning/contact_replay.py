@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.collision.coasting import coasting_reference
+from impactopt.collision.interface import CollisionModel
 from impactopt.collision.sdc import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import independent_rates
@@ -263,7 +264,8 @@ def collision_error(
     """Error of a problem's collision model against the often frozen SDC, for a collision of about this
     duration [s] that begins at q (nq,) and v (nv,) with the feed-forward ``torque`` (n,) [N m].
 
-    None if a contact does not end.
+    None if a contact does not end, and for an SDC of a robot with soft grips. With these, full dynamics are
+    in the place of the often frozen SDC.
     """
     names = ("robot", "striker", "normal", "law", "target", "stance")
     scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
@@ -277,8 +279,17 @@ def collision_error(
         # the coarser models have no settings for all of the reference
         known = {name: x for name, x in reference.items() if name in own.settings}
         coarse = own.collide(q, v, torque, **known)
-        full = frozen_model("sdc", freezes, **scene).collide(q, v, torque, **reference)
-    except InputError:  # a contact that does not end
+        full = _accurate(scene, freezes).collide(q, v, torque, **reference)
+    except InputError:  # a contact that does not end, or a model without the springs of soft grips
         return None
     errors = errors_against(coarse, full)
     return ModelError(impulse_pct=float(errors["impulse_error_pct"] or 0.0), zmp_mm=errors["zmp_error_mm"])
+
+
+def _accurate(scene: dict[str, Any], freezes: int) -> CollisionModel:
+    """Accurate collision model of a scene: the SDC with so many freezes, or full dynamics of soft grips."""
+    if not scene["robot"].sprung.any():
+        return frozen_model("sdc", freezes, **scene)
+    from impactopt.simulation.reference import FullDynamics  # loads MuJoCo
+
+    return FullDynamics(**scene)

@@ -33,6 +33,8 @@ from impactopt import (
     SpringDamper,
     VirtualMass,
     effective_mass,
+    holding_torque,
+    striking_velocity,
     talos,
 )
 from impactopt.collision import Collision
@@ -157,6 +159,23 @@ def test_histories_of_several_freezes_go_on_from_one_to_the_next():
     np.testing.assert_allclose(k.Jc @ result.velocity, 0.0, atol=1e-2)
     coarse = sdc.function(("time",), every=8)(q, v, torque)
     assert float(coarse[-1]) == pytest.approx(result.duration, abs=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
+@pytest.mark.parametrize("compiled", [True, False])
+def test_histories_end_at_separation_in_whichever_segment_it_is(compiled, monkeypatch):
+    """Here before the last, as the trial that divides the contact has taken it to be longer."""
+    if not compiled:
+        monkeypatch.setenv("IMPACTOPT_NO_COMPILER", "1")
+    robot = small()
+    law, target = SpringDamper(stiffness=22609.53351130677, damping=30.0), FreeMass(mass=286.62159211331305)
+    scene = {"robot": robot, "striker": "fist", "normal": X, "law": law, "target": target}
+    sdc = SDC(**scene, freezes=4, accuracy=None, horizon=0.5)
+    q = robot.posture("half_sitting")
+    v = striking_velocity(robot, q, "fist", X, 1.0)
+    hit = sdc.collide(q, 3.8987266111449332 * v, holding_torque(robot, q, v))
+    assert hit.time[-1] == pytest.approx(hit.duration, rel=1e-12)
+    assert hit.force[-1] == pytest.approx(0.0, abs=1e-9 * hit.peak_force)
 
 
 def test_a_contact_that_is_over_early_or_not_at_all_is_the_same_with_freezes():

@@ -371,6 +371,10 @@ def test_a_custom_law_is_its_class_written_out_and_its_numbers_are_inputs():
             {"compression": lambda x, rate: 2 * x, "restitution": lambda x, rate: x},
             "0.1 mm deep",
         ),
+        (
+            {"compression": lambda x, rate, k, gap: k * (x - gap), "k": 1e5, "gap": -2e-3},
+            "CustomLaw: the force is 200 N where contact begins",
+        ),
         ({"compression": lambda x, rate: x**1.5, "analytic": True}, "CustomLaw: analytic: .*analytic=False"),
         ({"compression": lambda x, rate, k: k * x, "k": np.inf}, "CustomLaw: k: inf"),
         ({"compression": lambda x, rate, k: k * x, "k": "soft"}, "CustomLaw: k: expected numbers"),
@@ -420,6 +424,14 @@ def test_a_smooth_law_is_its_formula_everywhere():
         compression = law._branches[0]
         for x in (-0.01, -1e-7, 0.0, 1e-7, 0.01):
             assert law.branch(x, 0.2, True) == compression(x, 0.2, **law.parameters)
+
+
+def test_a_force_below_zero_is_cut_from_a_linear_law():
+    """A spring that begins after a gap, in closed form, with either method."""
+    law = CustomLaw(compression=lambda x, rate, k, gap: k * (x - gap), analytic=True, k=1e5, gap=5e-3)
+    expected = [2 * REDUCED * 1.0, 5e-3 / 1.0 + np.pi * np.sqrt(REDUCED / 1e5)]
+    for options in ({}, {"method": "rk4", "step": 1e-5}):
+        assert through_sdc(law, **options) == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_law_written_as_a_class_needs_a_branch():

@@ -16,13 +16,16 @@ from impactopt import (
     Actuator,
     Effects,
     FreeMass,
+    FullDynamics,
     InputError,
     Robot,
     SoftGrip,
     SpringDamper,
     Tool,
+    VirtualMass,
     arm7,
     effective_mass,
+    holding_torque,
     planar_arm,
     striking_velocity,
     talos,
@@ -142,6 +145,39 @@ def test_without_a_spring_it_hits_as_a_hinge_does() -> None:
     z = 100.0 / (2 * np.sqrt(1e5 * reduced))
     closed = reduced * (1 + np.exp(-z * np.arccos(z) / np.sqrt(1 - z**2)))
     assert _impulse(bare, 1.0) == pytest.approx(closed, rel=1e-6)
+
+
+def _moving() -> tuple[Robot, Any, Any, Any, dict[str, Any]]:
+    """Arm, q, v, torque and scene of a blow in which the hammer turns in the hand."""
+    robot, normal = planar_arm().with_grip("hammer", grip()), np.array([0.0, 0.0, -1.0])
+    q = robot.posture("ready")
+    v = striking_velocity(robot, q, "hammer", normal, 1.0)
+    law, target = SpringDamper(stiffness=1e4, damping=50.0), FreeMass(mass=2.0)
+    scene = {"robot": robot, "striker": "hammer", "normal": normal, "law": law, "target": target}
+    return robot, q, v, holding_torque(robot, q, v), scene
+
+
+def test_in_full_dynamics_its_angle_of_rest_does_not_coast() -> None:
+    robot, q, v, torque, scene = _moving()
+    hit, own = FullDynamics(**scene).collide(q, v, torque), robot.sprung
+    assert abs(v[own]) > 1.0
+    moved, change = (hit.configuration - q)[own], (hit.velocity - v)[own]
+    np.testing.assert_allclose(hit.torque[-1, own], torque[own] - 20.0 * moved - 0.5 * change, atol=1e-6)
+
+
+def test_an_sdc_refuses_one_that_moves() -> None:
+    """Its servos all coast: the impulse would be a tenth too large."""
+    robot, q, v, torque, scene = _moving()
+    model = SDC(**scene)
+    with pytest.raises(InputError, match=r"hammer_grip: SDC has no spring.*take FullDynamics"):
+        model.collide(q, v, torque)
+    with pytest.raises(InputError, match="hammer_grip"):
+        model.batch(q[None], v[None], torque)
+    with pytest.raises(InputError, match="hammer_grip"):
+        model.function()
+    assert VirtualMass(**scene).collide(q, v).separated, "it has no servo"
+    v[robot.sprung] = 0.0
+    assert model.collide(q, v, torque).separated
 
 
 def test_its_servo_is_a_spring_whatever_the_reference_says() -> None:

@@ -16,6 +16,7 @@ from impactopt import (
     Board,
     BothSoles,
     Effects,
+    Free,
     FreeMass,
     FullDynamics,
     HuntCrossley,
@@ -28,6 +29,7 @@ from impactopt import (
     RigidWall,
     SpringDamper,
     holding_torque,
+    space_arm,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
@@ -335,15 +337,26 @@ def test_virtual_base_is_masses_added_to_the_feet():
 
 # ------------------------------------------------------------ feed-forward
 def test_holding_torque_keeps_the_velocities():
-    for robot in (biped(), small_robots.arm()):
+    for robot in (biped(), small_robots.biped(5), small_robots.arm()):
         q, v = next(iter(robot.postures.values())), np.zeros(robot.nv)
         frames = [sole.frame for sole in robot.soles]
         striker = next(iter(robot.strikers))
         k = Kinematics(robot, q, v, frames, striker, X)
         push = -k.bias
-        push[-robot.n :] += holding_torque(robot, q)
+        torque = holding_torque(robot, q)
+        push[-robot.n :] += torque
+        assert not torque[robot.hinges].any(), "nothing drives a hinge"
         left = push - k.Jc.T @ np.linalg.lstsq(k.Jc.T, push, rcond=None)[0]
         np.testing.assert_allclose(left, 0.0, atol=1e-9)
+
+
+def test_holding_torque_of_a_robot_that_floats_keeps_its_joints_rates():
+    robot = space_arm()
+    q, v = robot.posture("ready"), np.random.default_rng(0).normal(size=robot.nv)
+    push = np.concatenate([np.zeros(6), holding_torque(robot, q, v, stance=Free())])
+    acceleration = pin.aba(robot.model, robot.model.createData(), q, v, push)
+    np.testing.assert_allclose(acceleration[6:], 0.0, atol=1e-9)
+    assert np.abs(acceleration[:6]).max() > 1e-3, "only the base gives way"
 
 
 # ------------------------------------------------------------ targets that jump, laws that are flat at zero

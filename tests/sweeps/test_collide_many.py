@@ -16,17 +16,21 @@ from impactopt import (
     SDC,
     BothSoles,
     FixedBase,
+    Free,
     FreeMass,
     InputError,
+    Robot,
     SpringDamper,
     collide_many,
     holding_torque,
     load_robot,
+    space_arm,
     striking_velocity,
 )
 from impactopt.collide.contact_states import ContactStates, Posture
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin
 from impactopt.sweeps.collisions import Collisions
 
@@ -191,6 +195,20 @@ def test_gains_of_one_joint_and_of_all() -> None:
 
 
 # ---------------------------------------------------------------- states
+@pytest.mark.parametrize("robot, stance", [(biped(5), BothSoles()), (space_arm(), Free())])
+def test_states_have_torques_of_motors_only(robot: Robot, stance: Stance) -> None:
+    """Compiled as in NumPy: none about hinges of soles, and those of a robot that floats freely."""
+    (name, q), (striker, _) = next(iter(robot.postures.items())), next(iter(robot.strikers.items()))
+    states = ContactStates(robot=robot, striker=striker, stance=stance, start=q, folder=Path())
+    posture = states.posture(name, None, (0.0, 0.0, 0.0))
+    assert isinstance(posture, Posture)
+    found = states.compute(posture, {}, np.array([1.0]), np.array([1.0, 0.0, 0.0]), 1)
+    expected = holding_torque(robot, found.q[0], found.v[0], stance=stance)
+    assert np.abs(expected).max() > 0.1
+    assert found.torque[0] == pytest.approx(expected, abs=1e-8)
+    assert not found.torque[0, robot.hinges].any()
+
+
 @pytest.mark.parametrize("velocity", ["least energy", "least rates"])
 def test_states_move_the_striking_point_and_coast(velocity: str) -> None:
     robot, normal = biped(), np.array([0.8, 0.6, 0.0])

@@ -213,12 +213,12 @@ INLINE void law_and_slopes(const Data *d, double x, double rate, int compressing
   if (compressing) law_compressing(in, out, 0, 0, 0);
   else law_restoring(in, out, 0, 0, 0);
 #else
-  double law[6];
+  double law[4];
   const double *in[] = {d->law};
   double *out[] = {law};
   law_slopes(in, out, 0, 0, 0);
-  const double *mine = law + 3 * compressing;
-  found[0] = mine[0] + mine[1] * x + mine[2] * rate, found[1] = mine[1], found[2] = mine[2];
+  const double *mine = law + 2 * compressing;
+  found[0] = mine[0] * x + mine[1] * rate, found[1] = mine[0], found[2] = mine[1];
 #endif
 }
 

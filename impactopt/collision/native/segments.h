@@ -114,6 +114,12 @@ typedef struct {
 } Outcome;
 
 #if FREEZES
+/* Fills a segment that begins after separation with the last column of the one before. */
+static void repeat_last_column(const Record *record) {
+  const Record longer = {.out = record->out, .column = record->column - 1, .columns = record->columns + 1};
+  repeat_column(&longer, 0);
+}
+
 /* Integrates n segments from contact on, which together take about `duration`; w holds the model frozen at contact.
    A segment is integrated twice: to its middle with the last frozen model, where the model is frozen anew, and then
    whole with that one. */
@@ -169,8 +175,10 @@ static void run_segments(const double **arg, Work *w, Outcome *c, double duratio
       recorded->since = duration * begin;
       recorded->columns = N_COLUMNS[i];
     }
+    Record *record = c->in_contact ? recorded : 0;
+    if (recorded && !record) repeat_last_column(recorded);
     reached = start;
-    c->in_contact *= run(d, &reached, whole ? STEPS[i] : STEPS_AT_ALL, recorded, &w->tape).contact;
+    c->in_contact *= run(d, &reached, whole ? STEPS[i] : STEPS_AT_ALL, record, &w->tape).contact;
     if (recorded) recorded->column += N_COLUMNS[i];
     c->impulse += reached.impulse;
     c->duration += reached.time;

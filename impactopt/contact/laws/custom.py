@@ -7,6 +7,8 @@ from dataclasses import FrozenInstanceError
 from functools import partial
 from typing import Any, ClassVar
 
+import casadi as ca
+
 from impactopt.contact.fields import Parameters, choose
 from impactopt.contact.laws.base import ContactLaw, rough_at
 from impactopt.errors import InputError, check_array
@@ -24,7 +26,7 @@ class CustomLaw(ContactLaw):
     Each number becomes an input `contact_<name>` of a collision, with the value given here as its default.
     The functions are called as ``function(penetration, rate, **numbers)``, with CasADi expressions too:
     write ``casadi.fmax`` and ``casadi.if_else`` in the place of ``max`` and ``if``. They have to agree where
-    the rate is zero. A force below zero is cut, and so is one while apart.
+    the rate is zero. A force below zero is cut; at penetration and rate zero it must not be above.
 
     A plan's search passes through penetrations below zero. There x**1.5 is no number, and at zero it has no
     curvature. Such a force is continued along its tangent below 1e-6 m.
@@ -54,8 +56,8 @@ class CustomLaw(ContactLaw):
     Raises
     ------
     InputError : no function; numbers that are not finite; a function that does not take just these numbers,
-        or gives anything but one expression; functions that differ at rate zero; "analytic" for one that has
-        no curvature at zero.
+        or gives anything but one expression; functions that differ at rate zero, or have a force there at
+        penetration zero; "analytic" for one that has no curvature at zero.
     """
 
     # Each instance gets a class of its own with these functions, so that type(law)(**numbers) is the same law
@@ -96,6 +98,13 @@ class CustomLaw(ContactLaw):
         object.__setattr__(self, "_numbers", checked)
         object.__setattr__(self, "_rough", False)
         self._check_branches(f"function({', '.join(['penetration', 'rate', *checked])})")
+        for function in self._branches or ():
+            preload = float(ca.SX(function(ca.SX(0), ca.SX(0), **checked)))
+            if preload > 0:
+                raise InputError(
+                    f"CustomLaw: the force is {preload:g} N where contact begins, at penetration and "
+                    "rate zero: write functions that are zero there, or below"
+                )
         rough = rough_at([partial(function, **checked) for function in self._branches or ()])
         if self.analytic and rough == 0.0:
             raise InputError(

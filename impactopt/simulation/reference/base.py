@@ -48,6 +48,7 @@ class Forces:
     viscous, coulomb, transition : joint friction, as in `JointFriction`.
     feedforward : (n,) [N m].
     velocity : (n,) [rad/s] at contact; the servo's reference starts with it.
+    sprung : (n,) mask of soft grips, whose reference is their spring's angle of rest.
     mobility : [1/kg] of the target across the normal, see `tangential_mobility`.
     reference, reference_until : (n, k) [rad/s^(k + 1)], [s]: polynomial by which the reference's joint
         velocities change; see `Settings`.
@@ -65,6 +66,7 @@ class Forces:
     transition: float
     feedforward: Array
     velocity: Array
+    sprung: NDArray[np.bool_]
     reference: Array
     reference_until: float
     mobility: float
@@ -78,7 +80,8 @@ class Forces:
         velocity_change = self.reference * t**powers
         angle_change = velocity_change @ (t / (powers + 1) + (time - t))
         rate_error = self.velocity + velocity_change.sum(axis=1) - velocity
-        error = self.velocity * time + angle_change - moved
+        # an angle of rest does not coast; the damper's torque at contact is in the feed-forward, as in plans
+        error = np.where(self.sprung, 0.0, self.velocity) * time + angle_change - moved
         return self.feedforward + _times(self.kp, error) + _times(self.kd, rate_error)
 
     def torque(self, demand: Array, phase: Phase) -> Array:
@@ -283,6 +286,7 @@ class ReferenceModel(CollisionModel):
             transition=self._friction.transition,
             feedforward=check_array("torque [N m]", torque, (n,)),
             velocity=v[-n:],
+            sprung=self.robot.sprung,
             reference=values["reference"],
             reference_until=float(values["reference_until"]),
             mobility=tangential_mobility(self.contact_friction, self.target, of_target),

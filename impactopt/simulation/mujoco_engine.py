@@ -332,8 +332,10 @@ class _Replay(MujocoRobot):
             return f"still moves at the end: base at {speed:.2f} m/s"
         least = MIN_LOAD_FRACTION * weight_of(self.robot)
         normal, slip = simulation.sole_normal[-1], simulation.slip.max(axis=0)
-        for name, force, slid in zip(simulation.soles, normal, slip, strict=True):
-            if force < least:
+        stance = int(simulation.stance[-1]) if simulation.stance.size else 0
+        stands = self.scene.standing_soles(stance)  # the others are in the air
+        for k, (name, slid) in enumerate(zip(simulation.soles, slip, strict=True)):
+            if k in stands and normal[k] < least:
                 return f"the sole {name!r} carries no load at the end"
             if slid > MAX_SLIP:
                 return f"the sole {name!r} slid: {1e3 * slid:.0f} mm along the floor"

@@ -447,7 +447,7 @@ def simulate_mujoco(
             if has_passive:  # springs act at every step: no computer samples them
                 torque = np.where(passive, servo.springs(data.qpos[replay.qpos_index], rates), torque)
             speeds = replay.hand_speeds()
-            target_before, aside = replay.target, replay.tangential[0]
+            target_before, displacement = replay.target, (replay.travel, replay.tangential[0])
             push = replay.push(speeds, step)
             forces = none if push is None else push.forces
             replay.apply(torque, None if push is None else forces)
@@ -471,7 +471,7 @@ def simulate_mujoco(
                 force = 0.0 if push is None else float(push.total[0])
                 contact_values = force, replay.contact.speed(target_before), float(speeds[0])
                 loads = demand, torque, ground, corners, gears.take()
-                recorded.append((t, *state, *contact_values, aside, *loads, stance_at(now, t)))
+                recorded.append((t, *state, *contact_values, *displacement, *loads, stance_at(now, t)))
                 check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(t)
                 if fall:

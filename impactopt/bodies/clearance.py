@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -155,6 +156,14 @@ class Bodies:
                     self.touching.append((self.links.name(j), body.name))
                     continue
                 self.world_pairs.append((j, w))
+
+    def with_target_moved(self, displacement: Array) -> Bodies:
+        """Copy with the target and its supports displaced by (3,) [m]; the pairs are the same."""
+        moved = copy(self)
+        moved.world = tuple(
+            replace(body, place=body.place + displacement) if body.of_target else body for body in self.world
+        )
+        return moved
 
     @cached_property
     def shapes(self) -> Shapes:

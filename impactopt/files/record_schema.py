@@ -30,6 +30,7 @@ _HISTORIES = {
     **dict.fromkeys(("impulse", "saturated", "posture_error", "contact_start", "contact_end"), ""),
     "sole_ground": "k s 6",
     **dict.fromkeys(("contact_time", "contact_force"), "? m"),
+    "target_travel": "? k",
     "target_aside": "? k 3",
 }
 _SCHEMA: Mapping[str, Mapping[str, str]] = {

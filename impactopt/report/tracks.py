@@ -107,7 +107,8 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
     else:
         q, force = a[f"{prefix}_q"][chosen], a[f"{prefix}_force"][chosen]
         wrench, speed = a[f"{prefix}_sole_ground"].sum(axis=1)[chosen], a[f"{prefix}_target_speed"]
-    travel = travelled(time, speed, start)
+    # records of older versions do not have it
+    travel = a.get(f"{prefix}_target_travel", travelled(time, speed, start))
     if prefix == "reference" and record.summary.get("target", {}).get("broken", 1.0) < 0.5:
         travel[time > end] = 0.0  # an unbroken board springs back
     travel, aside = travel[chosen], _aside(a, prefix, shown, start)

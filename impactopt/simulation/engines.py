@@ -83,13 +83,16 @@ SAMPLING = 1e-3  # [s] between instants at which a replay's clearance may be com
 MIN_MOTION = 5e-4
 
 
-def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation:
-    """Simulation with its least clearance, and with unintended contacts if the engine has recorded none."""
+def with_clearance(problem: ImpactProblem, simulation: Simulation, distance: float) -> Simulation:
+    """Simulation with its least clearance, and with unintended contacts if the engine has recorded none.
+
+    distance [m] : displacement of the target along the normal, by a perturbation.
+    """
     time = simulation.time
-    chosen = _sampled(time, simulation.q, simulation.travel())
+    chosen = _sampled(time, simulation.q, simulation.target_travel)
     phase = np.full(len(time), MISSED) if simulation.missed else simulation.phase()
-    bodies = problem.bodies
-    travel, aside = simulation.travel()[chosen], simulation.aside()[chosen]
+    bodies = problem.bodies.with_target_moved(distance * problem.normal)
+    travel, aside = simulation.target_travel[chosen], simulation.aside()[chosen]
     at = Places.of(problem.robot, simulation.q[chosen], travel, phase[chosen], aside)
     survey = bodies.survey(time[chosen], at)
     touched = simulation.touched
@@ -233,7 +236,8 @@ def simulate(
     name, beyond = problem.robot.ranges.excess(problem.robot.joint_positions(simulation.q))
     beyond_range = (name, beyond) if beyond > ALLOWED_RANGE else ("", 0.0)
     simulation = replace(simulation, expected=float(reference.contact_start), beyond_range=beyond_range)
-    return with_clearance(problem, simulation)
+    perturbation = options.get("perturbation") or Perturbation()
+    return with_clearance(problem, simulation, perturbation.distance)
 
 
 def _check_options(given: Mapping[str, Any], defaults: Mapping[str, Any], end: float) -> None:

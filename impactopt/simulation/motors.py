@@ -20,9 +20,10 @@ class Servo:
     """Joint servo: feed-forward, stiffness and damping about a sampled reference, saturated.
 
     reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n). A time that occurs twice marks a jump.
-    kp, kd, limit : factors of the robot's kp, kd and torque limit.
+    kp, kd, limit : factors of the servo's kp, kd and torque limit.
 
-    Joints without a motor (`Robot.passive`) have a spring and a damper, at rest at the reference's start.
+    Joints without a motor (`Robot.passive`) have a spring and a damper, at rest at the reference's start, to
+    which the factors do not apply.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class Servo:
         angles[:, passive], rates[:, passive] = angles[0, passive], 0.0
         torques[:, passive] = torques[0, passive]
         self.limit[passive] = np.inf
+        self.kp[passive], self.kd[passive] = robot.kp[passive], robot.kd[passive]
         self.reference = np.hstack([angles, rates, torques])
 
     def target(self, t: float) -> Array:

@@ -332,8 +332,10 @@ class _Replay(MujocoRobot):
             return f"still moves at the end: base at {speed:.2f} m/s"
         least = MIN_LOAD_FRACTION * weight_of(self.robot)
         normal, slip = simulation.sole_normal[-1], simulation.slip.max(axis=0)
-        for name, force, slid in zip(simulation.soles, normal, slip, strict=True):
-            if force < least:
+        stance = int(simulation.stance[-1]) if simulation.stance.size else 0
+        stands = self.scene.standing_soles(stance)  # the others are in the air
+        for k, (name, slid) in enumerate(zip(simulation.soles, slip, strict=True)):
+            if k in stands and normal[k] < least:
                 return f"the sole {name!r} carries no load at the end"
             if slid > MAX_SLIP:
                 return f"the sole {name!r} slid: {1e3 * slid:.0f} mm along the floor"
@@ -445,7 +447,7 @@ def simulate_mujoco(
             if has_passive:  # springs act at every step: no computer samples them
                 torque = np.where(passive, servo.springs(data.qpos[replay.qpos_index], rates), torque)
             speeds = replay.hand_speeds()
-            target_before, aside = replay.target, replay.tangential[0]
+            target_before, displacement = replay.target, (replay.travel, replay.tangential[0])
             push = replay.push(speeds, step)
             forces = none if push is None else push.forces
             replay.apply(torque, None if push is None else forces)
@@ -469,7 +471,7 @@ def simulate_mujoco(
                 force = 0.0 if push is None else float(push.total[0])
                 contact_values = force, replay.contact.speed(target_before), float(speeds[0])
                 loads = demand, torque, ground, corners, gears.take()
-                recorded.append((t, *state, *contact_values, aside, *loads, stance_at(now, t)))
+                recorded.append((t, *state, *contact_values, *displacement, *loads, stance_at(now, t)))
                 check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(t)
                 if fall:

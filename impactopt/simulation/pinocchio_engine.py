@@ -378,6 +378,7 @@ def simulate_pinocchio(
                 (
                     t,
                     *motion,
+                    state.travel,
                     state.tangential[0],
                     torques.demand,
                     torques.motors,

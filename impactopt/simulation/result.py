@@ -114,6 +114,10 @@ class Scene:
         """Frames of the model that hit."""
         return (self.striker,) if self.second is None else (self.striker, self.second[0])
 
+    def standing_soles(self, stance: int) -> NDArray[np.intp]:
+        """Indices of the soles that stand in a stance phase."""
+        return np.flatnonzero(self.standing[stance]) if self.standing.size else np.arange(len(self.soles))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
@@ -124,6 +128,7 @@ class Simulation:
     q (k, nq), v (k, nv) : Pinocchio's
     force (k,) [N] : contact force of all strikers, at the instant
     target_speed, hand_speed (k,) : [m/s] along the normal
+    target_travel (k,) [m] : displacement of the target along the normal from its place at the planned contact
     target_aside (k, 3) [m] : displacement of the target across the normal; (0, 3): friction does not move it
     demand, torque (k, n) [N m] : of the servo before saturation, and of the motors
     gear (k, n) [N m] : torque of largest magnitude through each gear since the instant before
@@ -179,6 +184,7 @@ class Simulation:
     force: Array = field(repr=False)
     target_speed: Array = field(repr=False)
     hand_speed: Array = field(repr=False)
+    target_travel: Array = field(repr=False)
     demand: Array = field(repr=False)
     torque: Array = field(repr=False)
     sole_ground: Array = field(repr=False)
@@ -237,10 +243,6 @@ class Simulation:
     def sole_cop(self) -> Array:
         """Centre of pressure (k, soles, 2) [m] of each sole, world; nan where it does not press."""
         return centre_of_pressure(self.sole_ground)
-
-    def travel(self) -> Array:
-        """Travel (k,) [m] of the target along its normal since contact began."""
-        return travelled(self.time, self.target_speed, self.contact_start)
 
     def aside(self) -> Array:
         """Displacement (k, 3) [m] of the target across its normal; zero if friction does not move it."""
@@ -607,9 +609,9 @@ def simulation_of(
 ) -> Simulation:
     """Simulation from recorded instants.
 
-    recorded : of each instant: time, q, v, force, target speed, hand speed, target's displacement across the
-        normal, demand, torque, wrenches of soles and of supporting hands, positions of the soles' corners,
-        torque through the gears since the instant before, number of the stance phase.
+    recorded : of each instant: time, q, v, force, target speed, hand speed, target's displacement along
+        and across the normal, demand, torque, wrenches of soles and of supporting hands, positions of the
+        soles' corners, torque through the gears since the instant before, number of the stance phase.
     rest : the other fields of the simulation.
 
     Raises
@@ -619,7 +621,7 @@ def simulation_of(
     if not recorded:
         raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")
     columns = [np.array(c) for c in zip(*recorded, strict=True)]  # one array for each quantity
-    time, q, v, force, target_speed, hand_speed, aside, *more = columns
+    time, q, v, force, target_speed, hand_speed, travel, aside, *more = columns
     demand, torque, sole_ground, corners, gear, stance = more
     stance = stance if scene.standing.size else stance[:0]
     slip, lift = slip_and_lift(scene, corners, stance)
@@ -635,6 +637,7 @@ def simulation_of(
         force=force,
         target_speed=target_speed,
         hand_speed=hand_speed,
+        target_travel=travel,
         target_aside=aside if moves_target(scene.friction) else aside[:0],
         demand=demand,
         torque=torque,

@@ -174,7 +174,7 @@ class PhaseSequence:
         """Adds constraints where soles lift off or touch down, and while they are in the air."""
         for one, other in self._changes():
             self._add_change(one, other)
-        for k in self.numbers if len(self.numbers) > 1 else ():
+        for k in self.numbers:
             self._add_swing_feet(k)
 
     def _add_change(self, one: int, other: int) -> None:
@@ -257,6 +257,8 @@ class PhaseSequence:
             if sole in b.coordinates.soles:
                 continue
             lifted, lands = (j in self.numbers and sole.name in self._soles(j) for j in (k - 1, k + 1))
+            if k == 0 and self.numbers[-1] == p.blow:  # the motion's start, where all soles are on the ground
+                lifted = True
             # inf if the sole was not on the ground before, or does not come down after: no ramp there
             since = np.where(lifted, phase.nodes * T, np.inf)  # [s] lift-off
             until = np.where(lands, (1 - phase.nodes) * T, np.inf)  # [s] touch-down

@@ -136,15 +136,14 @@ def _joined(
 
 def height_pieces(problem: ImpactProblem, ways: Course) -> Iterator[Piece]:
     """Soles in the air are above the ground, and come down from above their footholds."""
-    if len(ways) == 1:
-        return
     for k, way in ways.items():
         robot, T = way.robot, float(np.mean(way.phase.duration))
         stand = {i: {leg.name: leg for leg, *_ in w.robot.soles} for i, w in ways.items()}
         for sole in problem.soles:
             if sole.name in stand[k]:
                 continue
-            left, foothold = sole.name in stand.get(k - 1, {}), stand.get(k + 1, {}).get(sole.name)
+            foothold = stand.get(k + 1, {}).get(sole.name)
+            left = sole.name in stand.get(k - 1, {}) or (k == 0 and way.nodes[0] > 0)  # from rest
             frame = robot.model.getFrameId(sole.frame)
             corners = np.column_stack([sole.polygon, np.zeros(len(sole.polygon))])
             for s in map(float, way.nodes):

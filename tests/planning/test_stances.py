@@ -330,6 +330,32 @@ def test_the_stance_of_a_problem_is_that_of_the_blow() -> None:
     assert biped_problem(biped()).hash == dataclasses.replace(biped_problem(biped()), stances=()).hash
 
 
+@pytest.mark.parametrize("first", [False, True], ids=["ends", "begins"])
+def test_a_foot_that_is_lifted_for_the_blow_at_the_end_or_the_start_stays_off_the_ground(first: bool) -> None:
+    """In a sequence of one phase, the follow-through or the swing, too."""
+    stances, start = STEPS[:2], biped_problem().start
+    if first:
+        stances, start = (StancePhase(soles=("left",)), BOTH), stepping().change_posture(0)
+    problem = stepping(stances=stances, start=start)
+    program = transcribed(problem)
+    result = solve_ipm(program.program, first_iterate(program))
+    assert result.status.usable, result.message
+    way = program.decode(result.x).trajectory()
+    model, sole = problem.robot.model, problem.robot.sole("right")
+    data, lowest = model.createData(), []
+    for q in way.q:
+        pin.framesForwardKinematics(model, data, q)
+        place = data.oMf[model.getFrameId(sole.frame)]
+        lowest.append(min(place.act(np.array([*corner, 0.0]))[2] for corner in sole.polygon))
+    height, lifted = np.array(lowest), ~problem.standing[way.stance, 1]
+    change = way.time[np.argmax(way.stance == 1)]
+    # 10 mm at nodes, from 0.2 s after lift-off until 0.2 s before touch-down
+    since, until = (0.0, change) if first else (change, np.inf)
+    late = lifted & (way.time > since + 0.2) & (way.time < until - 0.2)
+    assert height[late].min() > 0.009
+    assert height[lifted].min() > -1e-4
+
+
 # ---- what is made of such a plan
 
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from support.small_motions import scene, standing
+from support.small_motions import scene, standing, standing_on_left
 from support.small_robots import arm, biped
 
 from impactopt import InputError, Perturbation, Robot
@@ -208,6 +208,21 @@ def test_a_recovery_ends_inside_the_soles_which_stay(margin: float) -> None:
     for name in where.soles:
         i = model.getFrameId(name)
         np.testing.assert_allclose(data.oMf[i].homogeneous, before.oMf[i].homogeneous, atol=1e-6)
+
+
+def test_a_recovery_on_one_foot_leaves_the_leg_in_the_air_as_it_is() -> None:
+    robot, ref, where = standing_on_left()
+    ref.contact_start, ref.contact_end = 0.5, 0.6
+    aside = replace(where, polygon=where.polygon + np.array([0.02, 0.01]))
+    recovery = Recovery(robot, ref, aside, replace(QUIET, recovery_margin=1.0))
+    model, before, data = robot.model, robot.model.createData(), robot.model.createData()
+    assert np.abs(recovery.shift).max() > 0.01
+    lifted = [6 + k for k, name in enumerate(robot.joint_names) if name.startswith("right")]
+    np.testing.assert_array_equal(recovery.shift[lifted], 0.0)
+    pin.framesForwardKinematics(model, before, ref.q[-1])
+    pin.framesForwardKinematics(model, data, pin.integrate(model, ref.q[-1], recovery.shift))
+    foot = model.getFrameId(where.soles[0])
+    np.testing.assert_allclose(data.oMf[foot].homogeneous, before.oMf[foot].homogeneous, atol=1e-6)
 
 
 def test_a_recovery_slows_the_plan_down_without_a_jump() -> None:

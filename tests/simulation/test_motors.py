@@ -11,9 +11,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impactopt import Actuator, FreeMass, InputError, Robot, SpringDamper, Striker
+from impactopt import Actuator, FreeMass, InputError, Robot, SoftGrip, SpringDamper, Striker, load_problem
 from impactopt.report.result_rows import result_rows
-from impactopt.simulation.motors import Delay, Motors
+from impactopt.simulation.motors import Delay, Motors, Servo
 from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.mujoco_world import MujocoOptions, robot_bodies, spec_of
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
@@ -92,6 +92,17 @@ def test_without_data_nothing_is_between_servo_and_joint() -> None:
     motors, torque = Motors(robot), np.array([1e3])
     assert not motors.lines and motors.cut(torque, torque) is torque
     assert motors.after(0 * torque, torque, 1e-4) is torque and Delay(robot).at(1.0, torque) is torque
+
+
+def test_a_servo_with_other_gains_leaves_the_springs_of_a_grip_as_they_are() -> None:
+    grip = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5, point=[0.0, 0.0, 0.08])
+    robot = load_problem("arm_planar").robot.with_grip("hammer", grip)
+    (joint,) = np.flatnonzero(robot.passive)
+    q, none = np.zeros((2, robot.n)), np.zeros((2, robot.n))
+    ref = SimpleNamespace(time=np.array([0.0, 1.0]), q=q, v=none, torque=none)
+    servo = Servo(robot, ref, kp=0.5, kd=0.5)
+    torque = servo.springs(np.full(robot.n, 0.1), np.full(robot.n, 0.2))[joint]
+    assert torque == pytest.approx(-20.0 * 0.1 - 0.5 * 0.2)
 
 
 @pytest.mark.parametrize(

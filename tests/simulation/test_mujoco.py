@@ -13,7 +13,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.small_motions import blow_motion, given_until, reference, scene, standing, strike
+from support.small_motions import (
+    blow_motion,
+    given_until,
+    reference,
+    scene,
+    standing,
+    standing_on_left,
+    strike,
+)
 from support.small_robots import arm, biped, slider
 
 from impactopt import FreeMass, InputError, Perturbation, Robot, Solution, load_robot
@@ -285,6 +293,13 @@ def test_a_summary_of_a_fall_and_a_report() -> None:
     for key, least in (("sole_cop_margin_mm", 1e3 * sim.cop_margin), ("sole_force_N", sim.sole_normal)):
         for k, name in enumerate(("left", "right")):
             assert report[key][name] == {"swing": least[:, k].min()}
+
+
+def test_a_robot_that_is_to_end_on_one_foot_stands_on_it() -> None:
+    robot, motion, there = standing_on_left()
+    sim = simulate_mujoco(robot, motion, there, step=5e-4, settle=0.3)
+    assert sim.standing, sim.fall
+    np.testing.assert_allclose(sim.sole_normal[-1], [weight(robot), 0.0], atol=1e-3 * weight(robot))
 
 
 def test_what_slides_away_stands_no_more() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
@@ -33,9 +34,19 @@ from impactopt import (
     SpringDamper,
     Status,
     Target,
+    TargetBody,
 )
+from impactopt.bodies.clearance import Places
 from impactopt.report.console import replay_table
-from impactopt.simulation import Scene, Simulation, robustness, scene_of, simulate_mujoco, simulate_pinocchio
+from impactopt.simulation import (
+    Scene,
+    Simulation,
+    robustness,
+    scene_of,
+    simulate,
+    simulate_mujoco,
+    simulate_pinocchio,
+)
 from impactopt.simulation.engines import check_steps, with_step_error
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.transcription.initial_guess import first_iterate
@@ -316,3 +327,41 @@ def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[
         labels = " ".join(map(str, replay_table({**report, "engine": name}, summary).columns[0].cells))
         assert ("driven into the wood" in labels) == isinstance(target, Nail)
         assert ("the board breaks" in labels) == isinstance(target, Board)
+
+
+# ---- where the target is
+
+
+@ENGINES
+def test_a_target_that_comes_is_where_its_speed_has_brought_it(engine: Engine) -> None:
+    """From before it is hit, at another time than planned, and if it never is."""
+    for ahead in (0.0, 0.2):
+        robot, ref, there = hammer(
+            FreeMass(mass=1.0, initial_velocity=-2.0), SpringDamper(stiffness=1e4, damping=10.0)
+        )
+        ref.contact_start = 0.05
+        there = dataclasses.replace(there, point=there.point + np.array([ahead, 0.0, 0.0]))
+        done = engine(robot, ref, there, step=1e-4, settle=0.0)
+        assert np.isfinite(done.contact_start) == (not ahead)
+        before = done.time < (np.inf if ahead else done.contact_start)
+        np.testing.assert_allclose(done.target_travel[before], 2.0 * (0.05 - done.time[before]), atol=1e-9)
+
+
+@pytest.mark.parametrize("velocity", [0.0, -1.0])
+def test_a_clearance_is_to_the_target_where_it_is_in_the_replay(velocity: float) -> None:
+    """The robot rests, and the target stands still or comes: displaced, it is as much farther away."""
+    wide = TargetBody(shape="box", size=(0.9, 0.9, 0.1))  # so that the elbow is near its face
+    target = FreeMass(mass=3.0, initial_velocity=velocity)
+    problem = dataclasses.replace(arm_problem(), target=target, body=wide)
+    robot, q = problem.robot, problem.start_posture
+    torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
+    ref = reference([0.0, 0.1], q, torque=torque, nv=robot.nv, n=robot.n)
+    ref.contact_start = ref.contact_end = 0.1
+    still = simulate(problem, ref, engine="mujoco", settle=0.0)
+    assert np.isnan(still.contact_start) and still.nearest == ("elbow", "target")
+    world = Perturbation(distance=0.02)
+    away = simulate(problem, ref, engine="mujoco", settle=0.0, perturbation=world)
+    assert away.clearance == pytest.approx(still.clearance + 0.02, abs=1e-5)
+    bodies = problem.bodies
+    at = Places.of(robot, q[None], np.array([-velocity * (0.1 - still.time[-1])]), np.zeros(1, dtype=np.intp))
+    assert still.clearance == pytest.approx(bodies.survey(np.zeros(1), at).clearance, abs=1e-5)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from scipy.integrate import cumulative_trapezoid
 
 from impactopt import FreeMass, ImpactProblem, Impulse, Phase, Plan, Robot, Solution, SpringDamper, Status
 from impactopt.files.record import Record
@@ -110,6 +111,7 @@ def simulation_of(solution: Solution, *, touches: bool = True, peak: float = 0.9
         force=np.where(contact, 700.0 * (1 - fraction), 0.0),
         target_speed=1.01 * IMPULSE / MASS * fraction,
         hand_speed=np.full(len(time), 2.5),
+        target_travel=cumulative_trapezoid(1.01 * IMPULSE / MASS * fraction, time, initial=0.0),
         demand=demand,
         torque=demand,
         sole_ground=np.repeat(reference.ground[first][:, None] / 2, 2, axis=1),

@@ -111,6 +111,37 @@ def standing(robot: Robot, posture: str = "half_sitting") -> tuple[Any, Scene, A
     return ref, scene(striker, soles=frames, corners=corners, polygon=support_polygon(robot, c)), w
 
 
+def standing_on_left() -> tuple[Robot, Any, Scene]:
+    """The biped at rest on its left foot, the right one lifted: robot, reference, scene of both soles."""
+    robot = biped()
+    model, left = robot.model, robot.sole("left")
+    q, data = robot.posture("half_sitting"), robot.model.createData()
+    frame = model.getFrameId(left.frame)
+    pin.framesForwardKinematics(model, data, q)
+    foot = data.oMf[frame].copy()
+    for name, bend in (("hip pitch", -0.3), ("knee", 0.6), ("ankle pitch", -0.3)):
+        q[7 + robot.joint_index(f"right {name}")] += bend
+    c = StanceCoordinates(robot, (left,), q)
+    y, legs = c.split(q)
+    for _ in range(20):
+        y[:2] += foot.translation[:2] - np.array(pin.centerOfMass(model, data, c.join(y, legs)))[:2]
+        legs = c.solve_legs(y, legs)
+    q = c.join(y, legs)
+    w = static_wrenches(c, y, legs)
+    tau = pin.computeGeneralizedGravity(model, data, q) - c.sole_jacobians(q)[0].T @ w
+    ref = reference([0.0, 1.0], q, torque=tau[6:], nv=robot.nv, n=robot.n, end=0.05)
+    ref.stance = np.zeros(2, dtype=np.intp)
+    there = scene(
+        robot.striker("fist").model_frame,
+        soles=tuple(s.frame for s in robot.soles),
+        corners=tuple(s.polygon for s in robot.soles),
+        polygon=support_polygon(robot, c),
+        standing=np.array([[True, False]]),
+        polygons=(support_polygon(robot, c),),
+    )
+    return robot, ref, there
+
+
 def blow_motion() -> tuple[Robot, Any, Scene]:
     """The biped's arm swings against a mass in front of it: robot, reference, scene."""
     robot = biped()

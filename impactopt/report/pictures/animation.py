@@ -73,7 +73,7 @@ class _Drawing:
         ends = [model.frames[model.getFrameId(name)].parentJoint for name in self.scene.strikers]
         chain = {joint for end in ends for joint in model.supports[end]}
         self.strikes = np.array([j in chain for _, j in self.links])
-        self.travel, self.aside = self.sim.travel(), self.sim.aside()
+        self.travel, self.aside = self.sim.target_travel, self.sim.aside()
         self.figure = Figure(figsize=(9.4, 4.2), dpi=80)
         self.canvas: Any = FigureCanvasAgg(self.figure)
         self.panels: list[Any] = []

@@ -65,8 +65,9 @@ class Recovery:
         last = np.asarray(reference.q[-1])
         shift = np.zeros(robot.nv)
         if not scene.hands:  # a shift would tear off supporting hands
-            standing = np.asarray(reference.q[stance_begins(reference, stance_at(reference, np.inf))])
-            q = _shifted_posture(robot, last, standing, scene, settings.recovery_margin)
+            stance = stance_at(reference, np.inf)
+            standing = np.asarray(reference.q[stance_begins(reference, stance)])
+            q = _shifted_posture(robot, last, standing, scene, stance, settings.recovery_margin)
             shift = np.array(pin.difference(self.model, last, q))
         self.shift = shift * _clear_fraction(robot, reference, scene, shift)
         q = pin.integrate(self.model, last, self.shift)
@@ -138,13 +139,13 @@ def _com_goal(scene: Scene, com: Array, margin: float) -> Array:
     return np.asarray(com + fraction * (centre - com))
 
 
-def _shifted_posture(robot: Robot, q: Array, q0: Array, scene: Scene, margin: float) -> Array:
+def _shifted_posture(robot: Robot, q: Array, q0: Array, scene: Scene, stance: int, margin: float) -> Array:
     """q (nq,), shifted by base and legs until the centre of mass is inside the soles by a margin [m].
 
-    The soles stay where q0 has them, and the base keeps its orientation.
+    The soles that stand in a stance phase stay where q0 has them, and the base keeps its orientation.
     """
     model, data = robot.model, robot.model.createData()
-    soles = [model.getFrameId(name) for name in scene.soles]
+    soles = [model.getFrameId(scene.soles[k]) for k in scene.standing_soles(stance)]
     pin.framesForwardKinematics(model, data, q0)
     fixed = [data.oMf[i].copy() for i in soles]
     upright = pin.Quaternion(q[3:7]).toRotationMatrix()

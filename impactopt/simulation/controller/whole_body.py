@@ -343,10 +343,9 @@ class WholeBodyController:
 
     def _stance_problem(self, stance: int) -> StanceProblem:
         """QP of a stance phase, with its soles where the reference has them at the beginning of the phase."""
-        scene = self.scene
-        standing = scene.standing[stance] if scene.standing.size else np.ones(len(scene.soles), dtype=bool)
+        standing = self.scene.standing_soles(stance)
         q0 = np.asarray(self.reference.q[stance_begins(self.reference, stance)])
-        return StanceProblem(self.robot, scene, np.flatnonzero(standing), self.settings, q0)
+        return StanceProblem(self.robot, self.scene, standing, self.settings, q0)
 
     def torque(self, t: float, angles: Array, v: Array, rotation: Array, forces: Array) -> Array:
         """Torque demand (n,) [N m] at a time [s], from sensor readings of the true state.

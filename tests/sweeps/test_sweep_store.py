@@ -21,7 +21,7 @@ from impactopt import InputError
 from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.design import Found
 from impactopt.sweeps.store import Entry, Journal, Store
-from impactopt.sweeps.table import merge_kinds, unit_of, write_table
+from impactopt.sweeps.table import merge_kinds, read_columns, unit_of, write_table
 
 
 def same(a: Entry, b: Entry) -> None:
@@ -268,6 +268,17 @@ def test_small_parts_and_large_ones_become_one_table_with_units(tmp_path: Path) 
     }
     assert table.schema.field("x_m").metadata == {b"unit": b"m"}
     assert table.schema.metadata[b"impactopt.name"] == b"of tests"
+
+
+def test_a_number_that_no_case_has_is_a_column_of_nulls(tmp_path: Path) -> None:
+    # the impulse of a rigid impact has no peak of its force
+    parts: list[Any] = [(0, {"reason": [""], "peak_force_N": [None]}), (1, {"reason": ["bad"]})]
+    kinds: dict[str, str] = {}
+    for _, columns in parts:
+        merge_kinds(kinds, columns)
+    write_table(tmp_path / "t.parquet", parts, kinds, {})
+    assert np.isnan(read_columns(tmp_path / "t.parquet", ["peak_force_N"])["peak_force_N"]).all()
+    assert pq.read_schema(tmp_path / "t.parquet").field("peak_force_N").type == "double"
 
 
 @pytest.mark.parametrize(

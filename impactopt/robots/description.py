@@ -97,17 +97,20 @@ class Description:
     ties: list[Tie] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def lead_from_root(self) -> None:
+    def lead_from_root(self, locked: Iterable[str] | Mapping[str, float]) -> None:
         """Invert couplings whose leader comes after the follower in the tree, in place.
 
         Pinocchio needs leaders first. The motor's numbers (gains, torque and velocity limits) move from the
-        old leader to the new one, reflected by the ratio.
+        old leader to the new one, reflected by the ratio. A coupling with a locked joint is not inverted: the
+        other joint keeps its own motor.
         """
-        model, followers = self.model, {tie.follower for tie in self.ties}
+        model, fixed = self.model, set(locked)
+        followers = {tie.follower for tie in self.ties if fixed.isdisjoint(tie.joints)}
         for k, tie in enumerate(self.ties):
             law = tie.coupling
             if (
                 law is None
+                or not fixed.isdisjoint(tie.joints)
                 or not law.ratio
                 or law.leader in followers
                 or not model.existJointName(law.leader)

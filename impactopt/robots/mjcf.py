@@ -9,7 +9,7 @@ read actuators.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
@@ -356,17 +356,25 @@ def _including(file: Path) -> str:
     return ""
 
 
-def read_mjcf(path: str | PathLike[str], *, floating: bool | None = None) -> Description:
+def read_mjcf(
+    path: str | PathLike[str],
+    *,
+    floating: bool | None = None,
+    locked: Iterable[str] | Mapping[str, float] = (),
+) -> Description:
     """The robot of an MJCF: the subtree of the body with a free joint; else all bodies with joints.
 
     floating : with a free-flyer at the root, or without; None: as in the file.
+    locked : joints that will be removed; couplings to them do not move a motor's numbers.
 
     Raises
     ------
     InputError : no robot, or several; ball joints; equality constraints with other bodies.
     """
     mj = compile_mjcf(path)
-    return _Reader(mj, f"MJCF {path}", floating).read()
+    out = _Reader(mj, f"MJCF {path}", floating).read()
+    out.lead_from_root(locked)
+    return out
 
 
 class _Reader(Compiled):
@@ -413,7 +421,6 @@ class _Reader(Compiled):
         self.out.ties += ties_of(self, gravcomp, self.out.torque)
         self.out.tendons += tendons_of(self)
         self.out.notes += notes_of(self, gravcomp, self.out.torque)
-        self.out.lead_from_root()
         return self.out
 
     def _has_joints(self, root: int) -> bool:

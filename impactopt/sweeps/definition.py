@@ -229,7 +229,7 @@ class Sweep:
     def files(self) -> Mapping[str, str]:
         """Hashes of the robots' files and the saved results that cases read, by key and path."""
         data = {"robot": self.problem.data.get("robot", {}), "at_contact": self.at_contact}
-        paths = {key: [value] for key, value in flat(data)}
+        paths: dict[str, Column] = {key: [value] for key, value in flat(data)}
         paths |= {axis.key: axis.values for axis in self.design.axes}
         folders = dict.fromkeys(("robot.urdf", "robot.mjcf", "robot.srdf"), self.problem.path.parent)
         out = {}

@@ -17,12 +17,16 @@ from impactopt.robots.build import (
     effort_limit,
     joint_names,
     lock_joints,
+    moving_joints,
+    position_limit,
+    reference_configurations,
     set_velocity_limit,
     velocity_limit,
 )
-from impactopt.robots.checks import INERTIAS, REPAIRED, repair_inertias
+from impactopt.robots.checks import INERTIAS, POSITION_SLACK, REPAIRED, repair_inertias
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
-from impactopt.robots.tendons import Tendon
+from impactopt.robots.model import JointAngles
+from impactopt.robots.tendons import Ranges, Tendon
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +209,7 @@ class Description:
         repairs = tuple(repair_inertias(model)) if given["inertias"] == REPAIRED else ()
         every = {"name": given["name"] or model.name, kind: path, **self.options(model, options)}
         every["tendons"] = [*self.tendons_of(model, given["locked"]), *options.get("tendons", ())]
-        notes = (*self.notes, *self._approximated(model))
+        notes = (*self.notes, *self._approximated(model), *self._unreachable(model, every))
         own: dict[str, Any] = {kind: fspath(path), "options": {**given, **options}}
         return model, every, Source(repairs=repairs, notes=notes, **own)
 
@@ -225,6 +229,21 @@ class Description:
                 locked = ", ".join(repr(joint) for joint in tie.joints if joint not in joints)
                 moving = ", ".join(map(repr, unlocked))
                 yield f"{tie.text}; {locked} is locked, and does not move with {moving}"
+
+    def _unreachable(self, model: pin.Model, options: Mapping[str, Any]) -> Iterator[str]:
+        """Drop an MJCF's keyframes outside the ranges of joints and tendons from a model, with a note each.
+
+        A user's own postures, and an SRDF's, are refused there instead.
+        """
+        names = joint_names(model)
+        limits = position_limit(model, names, options.get("position_limit"))
+        ranges = Ranges.of(names, *limits, options["tendons"])
+        angles = JointAngles(moving_joints(model))
+        for name, q in reference_configurations(model).items() if self.kind == "MJCF" else ():
+            worst, excess = ranges.excess(angles.of(q)[None])
+            if excess > POSITION_SLACK and name not in (options.get("postures") or {}):
+                del model.referenceConfigurations[name]
+                yield f"keyframe {name!r} is left out: {worst} is out of its range there"
 
 
 def between(model: pin.Model, one: int, other: int) -> tuple[str, ...]:

@@ -588,20 +588,17 @@ class _Reader(Compiled):
         )
 
     def _keyframes(self) -> None:
-        """Read the keyframes inside the position limits as reference configurations."""
+        """Read the keyframes as reference configurations."""
         mj = self.mj
         for k in range(mj.nkey):
-            q, inside = pin.neutral(self.model), True
+            q = pin.neutral(self.model)
             angles = [float(mj.key_qpos[k][mj.jnt_qposadr[j]]) for j in self.joint]
-            for j, angle in zip(self.joint, angles, strict=True):
-                inside &= not mj.jnt_limited[j] or mj.jnt_range[j][0] <= angle <= mj.jnt_range[j][1]
             JointAngles([self.model.joints[i] for i in self.joint.values()]).put(q, angles)
             if self.floating and self._free(self.roots[0]):
                 start = int(mj.jnt_qposadr[int(mj.body_jntadr[self.roots[0]])])
                 where = mj.key_qpos[k][start : start + 7]
                 q[:7] = pin.SE3ToXYZQUAT(_placement(where[:3], where[3:]))
-            if inside:
-                self.model.referenceConfigurations[self.name("key", k)] = q
+            self.model.referenceConfigurations[self.name("key", k)] = q
 
 
 def _force_limit(mj: Any, a: int, affine: bool) -> float:

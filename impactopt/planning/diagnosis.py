@@ -32,7 +32,8 @@ def ipopt_retry(budget: Budget, program: NonlinearProgram, start: Array, old: So
     IPOPT has another restoration phase, so it rarely fails on the same programs. A limit that the caller has
     set is a diagnosis.
     """
-    undiagnosed = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
+    limited = "max_iterations" in (budget.options or {})
+    undiagnosed = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not limited)
     if budget.solver == "ipopt" or not undiagnosed or budget.is_over():
         return old
     violation = max_violation(program, old.x, program.constraints(old.x))

@@ -178,7 +178,7 @@ def _keeps_limits(problem: ImpactProblem, swing_duration: float, speed: float) -
             q, v, a, *_ = complete_reference(problem, y, yd, ydd, wrench, legs0)
         except InputError:  # a leg is too short for the base's motion
             return False
-        joints, rates = r.ranges.positions(q[:, -r.n :]), v[:, -r.n :]
+        joints, rates = r.ranges.positions(r.joint_positions(q)), v[:, -r.n :]
         if (joints < lower).any() or (joints > upper).any():
             return False
         if (np.abs(rates) > problem.term(VelocityLimit).most(r)).any():

@@ -91,6 +91,7 @@ def drive_nail(
         )
     blows: list[Blow] = []
     at, x = nail.depth, options.pop("start", "reach")
+    from_plan = {name: value for name, value in options.items() if name != "starts"}  # a plan is one start
     while at < depth:
         if len(blows) == most:
             return Series(blows=tuple(blows), reason=f"the nail is not in yet at {1e3 * at:.1f} mm")
@@ -100,7 +101,7 @@ def drive_nail(
             point=problem.point + (at - nail.depth) * problem.normal,
             target=dataclasses.replace(nail, depth=at),
         )
-        solution = solve(here, start=x, report=report, **options)
+        solution = solve(here, start=x, report=report, **(from_plan if blows else options))
         stopped = solution.status is Status.INTERRUPTED
         if not (isinstance(x, str) or solution.status.usable or stopped):
             solution = solve(here, start="reach", report=report, **options)

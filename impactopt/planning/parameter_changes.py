@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError, check_array, check_choice, check_number
-from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS, TERMS, ContactWrenchCone, Term
 
@@ -37,15 +36,14 @@ def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
     if "contact_posture" in problem.__dict__:
         # From the old posture the search ends in the nearest one, so a small change of
         # the point changes it little.
-        near, point = problem.contact_posture, fields.get("point", problem.point)
         with contextlib.suppress(InputError):  # then the checks search from the start posture
-            new.__dict__["contact_posture"] = (
-                near
-                if np.array_equal(point, problem.point)
-                else inverse_kinematics(
-                    problem.coordinates, problem.striker, check_array("point [m]", point, (3,)), near
-                )
+            aim = {name: check_array(name, getattr(new, name), (3,)) for name in ("point", "normal")}
+            new.__dict__.update(aim)
+            same = new.second is problem.second and all(
+                np.array_equal(value, getattr(problem, name)) for name, value in aim.items()
             )
+            near = problem.contact_posture
+            new.__dict__["contact_posture"] = near if same else new.contact_posture_near(near)
     new.__post_init__()
     return new
 

@@ -444,7 +444,17 @@ class ImpactProblem:
 
     @cached_property
     def contact_posture(self) -> Array:
-        """Posture (nq,) with the striking point at ``point`` and the soles in place, by inverse kinematics.
+        """Posture (nq,) at contact, as of `contact_posture_near` the posture in which the last stance begins.
+
+        Raises
+        ------
+        InputError : the point is out of reach.
+        """
+        return self.contact_posture_near(self.change_posture(self.blow - 1))
+
+    def contact_posture_near(self, guess: Array) -> Array:
+        """Posture (nq,) with the strikers at their points and the soles in place, by inverse kinematics from
+        a posture (nq,).
 
         The hand has the orientation of `HandOrientation` if that is possible.
 
@@ -452,7 +462,7 @@ class ImpactProblem:
         ------
         InputError : the point is out of reach.
         """
-        given = self.coordinates, self.striker, self.point, self.change_posture(self.blow - 1)
+        given = self.coordinates, self.striker, self.point, guess
         also = self.contacts[1:]
         if (hand := self.extra(HandOrientation)) is not None:
             direction = self.normal if hand.direction is None else np.array(hand.direction)

@@ -304,6 +304,7 @@ def check_configuration(model: pin.Model, q: ArrayLike, name: str) -> Array:
     return q
 
 
+POSITION_SLACK = 1e-9  # [rad], [m] of rounding beyond a range
 UNIT_TOLERANCE = 1e-6  # of the length of a part of a configuration that should be one
 
 
@@ -322,11 +323,10 @@ def unit_parts(model: pin.Model) -> list[tuple[int, slice]]:
 
 def check_positions(joints: Sequence[str], angles: Array, lower: Array, upper: Array, name: str) -> None:
     """InputError with the joints outside their position limits."""
-    slack = 1e-9  # [rad] of rounding
     outside = [
         f"{joint!r} at {x:.4g} (limits {low:.4g} to {high:.4g})"
         for joint, x, low, high in zip(joints, angles, lower, upper, strict=True)
-        if not low - slack <= x <= high + slack
+        if not low - POSITION_SLACK <= x <= high + POSITION_SLACK
     ]
     if outside:
         raise InputError(f"{name}: outside its position limits [rad]: {', '.join(outside)}; move it inside")

@@ -17,12 +17,16 @@ from impactopt.robots.build import (
     effort_limit,
     joint_names,
     lock_joints,
+    moving_joints,
+    position_limit,
+    reference_configurations,
     set_velocity_limit,
     velocity_limit,
 )
-from impactopt.robots.checks import INERTIAS, REPAIRED, repair_inertias
+from impactopt.robots.checks import INERTIAS, POSITION_SLACK, REPAIRED, repair_inertias
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
-from impactopt.robots.tendons import Tendon
+from impactopt.robots.model import JointAngles
+from impactopt.robots.tendons import Ranges, Tendon
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,17 +101,20 @@ class Description:
     ties: list[Tie] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def lead_from_root(self) -> None:
+    def lead_from_root(self, locked: Iterable[str] | Mapping[str, float]) -> None:
         """Invert couplings whose leader comes after the follower in the tree, in place.
 
         Pinocchio needs leaders first. The motor's numbers (gains, torque and velocity limits) move from the
-        old leader to the new one, reflected by the ratio.
+        old leader to the new one, reflected by the ratio. A coupling with a locked joint is not inverted: the
+        other joint keeps its own motor.
         """
-        model, followers = self.model, {tie.follower for tie in self.ties}
+        model, fixed = self.model, set(locked)
+        followers = {tie.follower for tie in self.ties if fixed.isdisjoint(tie.joints)}
         for k, tie in enumerate(self.ties):
             law = tie.coupling
             if (
                 law is None
+                or not fixed.isdisjoint(tie.joints)
                 or not law.ratio
                 or law.leader in followers
                 or not model.existJointName(law.leader)
@@ -202,7 +209,7 @@ class Description:
         repairs = tuple(repair_inertias(model)) if given["inertias"] == REPAIRED else ()
         every = {"name": given["name"] or model.name, kind: path, **self.options(model, options)}
         every["tendons"] = [*self.tendons_of(model, given["locked"]), *options.get("tendons", ())]
-        notes = (*self.notes, *self._approximated(model))
+        notes = (*self.notes, *self._approximated(model), *self._unreachable(model, every))
         own: dict[str, Any] = {kind: fspath(path), "options": {**given, **options}}
         return model, every, Source(repairs=repairs, notes=notes, **own)
 
@@ -222,6 +229,21 @@ class Description:
                 locked = ", ".join(repr(joint) for joint in tie.joints if joint not in joints)
                 moving = ", ".join(map(repr, unlocked))
                 yield f"{tie.text}; {locked} is locked, and does not move with {moving}"
+
+    def _unreachable(self, model: pin.Model, options: Mapping[str, Any]) -> Iterator[str]:
+        """Drop an MJCF's keyframes outside the ranges of joints and tendons from a model, with a note each.
+
+        A user's own postures, and an SRDF's, are refused there instead.
+        """
+        names = joint_names(model)
+        limits = position_limit(model, names, options.get("position_limit"))
+        ranges = Ranges.of(names, *limits, options["tendons"])
+        angles = JointAngles(moving_joints(model))
+        for name, q in reference_configurations(model).items() if self.kind == "MJCF" else ():
+            worst, excess = ranges.excess(angles.of(q)[None])
+            if excess > POSITION_SLACK and name not in (options.get("postures") or {}):
+                del model.referenceConfigurations[name]
+                yield f"keyframe {name!r} is left out: {worst} is out of its range there"
 
 
 def between(model: pin.Model, one: int, other: int) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ read actuators.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
@@ -356,17 +356,25 @@ def _including(file: Path) -> str:
     return ""
 
 
-def read_mjcf(path: str | PathLike[str], *, floating: bool | None = None) -> Description:
+def read_mjcf(
+    path: str | PathLike[str],
+    *,
+    floating: bool | None = None,
+    locked: Iterable[str] | Mapping[str, float] = (),
+) -> Description:
     """The robot of an MJCF: the subtree of the body with a free joint; else all bodies with joints.
 
     floating : with a free-flyer at the root, or without; None: as in the file.
+    locked : joints that will be removed; couplings to them do not move a motor's numbers.
 
     Raises
     ------
     InputError : no robot, or several; ball joints; equality constraints with other bodies.
     """
     mj = compile_mjcf(path)
-    return _Reader(mj, f"MJCF {path}", floating).read()
+    out = _Reader(mj, f"MJCF {path}", floating).read()
+    out.lead_from_root(locked)
+    return out
 
 
 class _Reader(Compiled):
@@ -413,7 +421,6 @@ class _Reader(Compiled):
         self.out.ties += ties_of(self, gravcomp, self.out.torque)
         self.out.tendons += tendons_of(self)
         self.out.notes += notes_of(self, gravcomp, self.out.torque)
-        self.out.lead_from_root()
         return self.out
 
     def _has_joints(self, root: int) -> bool:
@@ -581,20 +588,17 @@ class _Reader(Compiled):
         )
 
     def _keyframes(self) -> None:
-        """Read the keyframes inside the position limits as reference configurations."""
+        """Read the keyframes as reference configurations."""
         mj = self.mj
         for k in range(mj.nkey):
-            q, inside = pin.neutral(self.model), True
+            q = pin.neutral(self.model)
             angles = [float(mj.key_qpos[k][mj.jnt_qposadr[j]]) for j in self.joint]
-            for j, angle in zip(self.joint, angles, strict=True):
-                inside &= not mj.jnt_limited[j] or mj.jnt_range[j][0] <= angle <= mj.jnt_range[j][1]
             JointAngles([self.model.joints[i] for i in self.joint.values()]).put(q, angles)
             if self.floating and self._free(self.roots[0]):
                 start = int(mj.jnt_qposadr[int(mj.body_jntadr[self.roots[0]])])
                 where = mj.key_qpos[k][start : start + 7]
                 q[:7] = pin.SE3ToXYZQUAT(_placement(where[:3], where[3:]))
-            if inside:
-                self.model.referenceConfigurations[self.name("key", k)] = q
+            self.model.referenceConfigurations[self.name("key", k)] = q
 
 
 def _force_limit(mj: Any, a: int, affine: bool) -> float:

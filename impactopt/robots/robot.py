@@ -146,7 +146,7 @@ class Robot:
         InputError : no such file; unless their joints are locked, Gazebo's loops, and a <mimic> that is not
             supported.
         """
-        read = _urdf.read_urdf(path, srdf, floating=floating, repaired=inertias == REPAIRED)
+        read = _urdf.read_urdf(path, srdf, floating=floating, locked=locked, repaired=inertias == REPAIRED)
         given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, "inertias": inertias}
         model, all_options, source = read.made(path, given, options)
         robot = cls.from_model(model, **all_options)
@@ -179,7 +179,7 @@ class Robot:
         InputError : no MuJoCo; no robot; ball joints; unless their joints are locked, tendons, loops, and
             joints that follow others nonlinearly.
         """
-        read = _mjcf.read_mjcf(path, floating=floating)
+        read = _mjcf.read_mjcf(path, floating=floating, locked=locked)
         given = {"name": name, "floating": floating, "locked": locked, "inertias": inertias}
         model, all_options, source = read.made(path, given, options)
         return dataclasses.replace(cls.from_model(model, **all_options), source=source)

@@ -6,7 +6,7 @@ change the dynamics become ties or notes of the `Description`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from os import PathLike
 from pathlib import Path
 from xml.etree.ElementTree import Element, TreeBuilder, tostring
@@ -30,10 +30,12 @@ def read_urdf(
     srdf: str | PathLike[str] | None = None,
     *,
     floating: bool,
+    locked: Iterable[str] | Mapping[str, float] = (),
     repaired: bool = False,
 ) -> Description:
     """The robot of a URDF, with an SRDF's reference configurations and rotors (as armature).
 
+    locked : joints that will be removed; couplings to them do not move a motor's numbers.
     repaired : do not check moments of inertia, as they will be repaired.
 
     Raises
@@ -69,7 +71,7 @@ def read_urdf(
     out.springs |= _springs(root, model)
     out.unranged += _unranged(root)
     out.notes += [*_weightless(root), *_rotors(root)]
-    out.lead_from_root()
+    out.lead_from_root(locked)
     return out
 
 

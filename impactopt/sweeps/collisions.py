@@ -40,11 +40,9 @@ from impactopt.files.toml import Place, plain_value
 # "structure", which changes the robot or the model.
 Role = Literal["number", "point", "structure"]
 
-# settings of the servo, by the places of their values and of factors on them
-SERVO = {
-    ("robot", "kp_N_m_rad"): "kp",
-    ("robot", "kd_N_m_s_rad"): "kd",
-    ("robot", "torque_limit_N_m"): "torque_limit",
+# Settings of the servo, by the places of factors on them. The robot's own gains are structure: one changes
+# the default of another, and they leave soft grips as they are.
+SERVO_SCALES = {
     ("at_contact", "kp_scale"): "kp",
     ("at_contact", "kd_scale"): "kd",
     ("at_contact", "torque_limit_scale"): "torque_limit",
@@ -73,7 +71,7 @@ def role_of(place: Place) -> Role:
     table, *rest = place
     if table in _TYPE_KEYS:
         return "structure" if rest == [_TYPE_KEYS[str(table)]] else "number"
-    if place[:2] in SERVO or place[:2] in _STATE:
+    if place[:2] in SERVO_SCALES or place[:2] in _STATE:
         return "number"
     if place[:2] == ("problem", "point_m"):
         return "point"
@@ -211,9 +209,7 @@ class CollisionBatch:
         if not good.size:
             return out
         states = states.some(good)
-        settings = {
-            name: x[good] if len(x) == count else x for name, x in self._settings(numbers, count).items()
-        }
+        settings = {name: x[good] if len(x) == count else x for name, x in self._settings(numbers).items()}
         settings |= states.reference_settings
         # a point mass has no servo, and the paper's SDC no stiffness
         known = getattr(model, "settings", settings)
@@ -234,20 +230,16 @@ class CollisionBatch:
         out["reason"][good] = reason
         return out
 
-    def _settings(self, numbers: Numbers, count: int) -> dict[str, Array]:
+    def _settings(self, numbers: Numbers) -> dict[str, Array]:
         """Parameters of law, target and servo by their names in `Settings`, (count, ...) or (1, ...)."""
         section, robot = self.section, self.model.robot
         out = {"kp": robot.kp[None], "kd": robot.kd[None], "torque_limit": robot.torque_limit[None]}
         scales: dict[str, Any] = {"kp": section.kp_scale, "kd": section.kd_scale}
         scales["torque_limit"] = section.torque_limit_scale
         for place, values in numbers.items():
-            name = SERVO.get((str(place[0]), str(place[1])))
+            name = SERVO_SCALES.get((str(place[0]), str(place[1])))
             if place[0] in ("target", "contact"):
                 out[setting_of(place, self.file.content)] = values.astype(float)
-            elif name is not None and place[0] == "robot":
-                joint = slice(None) if len(place) == 2 else robot.joint_index(str(place[2]))
-                out[name] = np.broadcast_to(out[name], (count, robot.n)).copy()
-                out[name].T[joint] = values
             elif name is not None:
                 scales[name] = values[:, None]
         return out | {name: out[name] * scale for name, scale in scales.items()}
@@ -346,9 +338,9 @@ def collide_many(
     ----------
     problem : a problem file, its path, or its name.
     columns : values (N,), or a single one for all collisions, by key path: numbers of the problem file's
-        [target], [contact] and servo (robot.kp, robot.kd, robot.torque_limit, for all joints or one), of
-        [at_contact], and problem.point. Each combination of other values, such as those of [friction], makes
-        a robot or model: these should be few.
+        [target], [contact] and [at_contact] (kd_scale is a factor on all dampings), and problem.point. Each
+        combination of other values, such as those of [friction] or robot.kd, makes a robot or model: these
+        should be few.
     outputs : names of columns; see docs/sweeps.md. Only what they need is computed. For a million collisions
         leave out freeze_error_pct, which takes some six times as long as the impulse.
     at_contact : the keys of [at_contact] that no column gives; see docs/sweeps.md.

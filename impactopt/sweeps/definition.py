@@ -19,6 +19,7 @@ from impactopt.codegen.files import is_plain_file, read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.named_problems import problem_file, sweep_file
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
+from impactopt.files.record import NUMBERS
 from impactopt.files.sections.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.files.toml import (
     LONGEST_TEXT,
@@ -225,11 +226,30 @@ class Sweep:
         return self.settings.name or self.path.stem
 
     @property
+    def files(self) -> Mapping[str, str]:
+        """Hashes of the robots' files and the saved results that cases read, by key and path."""
+        data = {"robot": self.problem.data.get("robot", {}), "at_contact": self.at_contact}
+        paths: dict[str, Column] = {key: [value] for key, value in flat(data)}
+        paths |= {axis.key: axis.values for axis in self.design.axes}
+        folders = dict.fromkeys(("robot.urdf", "robot.mjcf", "robot.srdf"), self.problem.path.parent)
+        out = {}
+        for key, folder in (folders | {"at_contact.result": self.path.parent}).items():
+            for path in paths.get(key, ()):
+                # a missing file is a case's mistake
+                for place in filter(is_plain_file, (folder / path, folder / path / NUMBERS)):
+                    out[f"{key} {path}"] = hashlib.sha256(place.read_bytes()).hexdigest()[:16]
+        return out
+
+    @property
     def hash(self) -> str:
-        """Hexadecimal hash of the data of the sweep file and its problem file; comments do not count."""
-        both = json.dumps([self.content, self.problem.data], sort_keys=True)
+        """Hexadecimal hash of the data of the sweep file and its problem file, without their comments, and of
+        the files that they name.
+        """
+        # the built problem has what they do not name, such as the files of a preset, or of an MJCF's includes
+        data = [self.content, self.problem.data, self.problem.build().hash, self.files]
         # with all values, as another version of SciPy might draw other ones
-        return hashlib.sha256(both.encode() + self.design.content()).hexdigest()[:16]
+        content = json.dumps(data, sort_keys=True).encode() + self.design.content()
+        return hashlib.sha256(content).hexdigest()[:16]
 
 
 def read_sweep_file(

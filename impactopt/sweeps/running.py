@@ -225,7 +225,7 @@ def _write(
         "case_kind": chosen.settings.case_kind,
         "cases": str(counter.cases),
         "done": str(counter.done),
-        "sweep_hash": chosen.hash,
+        "sweep_hash": store.hash,
         "problem_hash": problem.hash,
         "versions": json.dumps(versions()),
         "sweep": chosen.text,

@@ -5,7 +5,8 @@ SQLite handles kills and full disks: a record is there as a whole or not at all,
 `Journal.add` returns. Records have a checksum: a unit whose record is damaged is evaluated again. A file that
 is not a journal, or whose pages are damaged, is refused, and nothing in it is changed.
 
-* sweep.json      data of the sweep file and the problem file, and the versions that compute the results
+* sweep.json      data of the sweep file and the problem file, hashes of the files that they name, and the
+                  versions that compute the results
 * sweep.toml      the sweep file
 * units.sqlite    every finished unit (`Journal`)
 * solved/N/       plans that others start from, if cases start from their neighbours
@@ -163,7 +164,7 @@ def _unpack(content: bytes) -> Entry:
     return Entry(unit=given["unit"], peak_mb=given["peak_mb"], columns=ordered)
 
 
-FORMAT = 2  # of sweep.json and the journal
+FORMAT = 3  # of sweep.json and the journal
 UNITS, UNITS_OLD = "units.sqlite", "units.journal"  # names of the journal: now, and in format 1
 MAX_NAMED = 5  # changes in a message
 
@@ -171,7 +172,7 @@ MAX_NAMED = 5  # changes in a message
 class Store:
     """Directory of a sweep, locked for this process until `close`.
 
-    journal : of the finished units.
+    journal : of the finished units.  hash : of the sweep.
 
     Raises
     ------
@@ -183,6 +184,7 @@ class Store:
         self.path = make_directory(out)
         self._lock = _lock(self.path)
         try:
+            self.hash = sweep.hash
             self._claim(sweep)
             self.journal = Journal(self.path / UNITS)
         except BaseException:
@@ -212,10 +214,11 @@ class Store:
         place = self.path / "sweep.json"
         now: dict[str, Any] = {
             "format": FORMAT,
-            "hash": sweep.hash,
+            "hash": self.hash,
             "versions": versions(),
             "sweep": sweep.content,
             "problem": sweep.problem.data,
+            "files": sweep.files,
         }
         try:
             before = json.loads(place.read_text(encoding="utf-8"))
@@ -274,7 +277,11 @@ def _lock(path: Path) -> int:
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Message with the settings that differ between two sweep.json, or that only one of them has."""
     old, new = (
-        {**dict(flat(data.get("sweep", {}))), **dict(flat(data.get("problem", {}), "problem file: "))}
+        {
+            **dict(flat(data.get("sweep", {}))),
+            **dict(flat(data.get("problem", {}), "problem file: ")),
+            **dict(flat(data.get("files", {}), "content of ")),
+        }
         for data in (before, now)
     )
     none = "not given"

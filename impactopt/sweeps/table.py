@@ -127,7 +127,8 @@ def write_table(
     """Write a table, with rows in the order of the parts; it replaces an old file atomically.
 
     parts : a column that a part does not have is null there.
-    kinds : type of each column, "float", "int", "bool", "text" or "json" (`merge_kinds`).
+    kinds : type of each column, "float", "int", "bool", "text" or "json", or "" for nulls only
+        (`merge_kinds`).
     metadata : text by name, under `impactopt.<name>`. Each column has its unit, and `impactopt.units` has
     all.
 
@@ -142,6 +143,7 @@ def write_table(
         "bool": arrow.bool_(),
         "text": arrow.string(),
         "json": arrow.string(),
+        "": arrow.float64(),  # a number that no case has, such as the peak force of rigid impacts
     }
     fields = [arrow.field("case", arrow.int64())]
     units = {name: unit_of(name) for name in kinds if unit_of(name)}
@@ -162,7 +164,9 @@ def write_table(
 
 
 def merge_kinds(kinds: dict[str, str], columns: Columns) -> None:
-    """Update the kinds of columns by more of their values; "json" if values are of different kinds."""
+    """Update the kinds of columns by more of their values; "json" if values are of different kinds, "" while
+    all are None.
+    """
     for name, values in columns.items():
         kind = _kind(values)
         before = kinds.get(name, "")

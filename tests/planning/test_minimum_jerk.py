@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from support.small_robots import arm, biped, striking_point
 
@@ -15,7 +16,9 @@ from impactopt import (
     ImpactProblem,
     InputError,
     Phase,
+    Robot,
     SpringDamper,
+    Striker,
     TorqueLimit,
 )
 from impactopt.planning.minimum_jerk import _keeps_limits, _profile, _wrenches_exist, minimum_jerk_baseline
@@ -23,12 +26,18 @@ from impactopt.planning.minimum_jerk import _keeps_limits, _profile, _wrenches_e
 LAW = SpringDamper(stiffness=1e4, damping=300.0)
 
 
-def reach_of(robot: Any, posture: str, striker: str, **options: Any) -> ImpactProblem:
+def reach_of(
+    robot: Any,
+    posture: str,
+    striker: str,
+    shift: tuple[float, float, float] = (0.05, 0.03, 0.03),
+    **options: Any,
+) -> ImpactProblem:
     return ImpactProblem(
         robot=robot,
         striker=striker,
         start=posture,
-        point=striking_point(robot, posture, striker) + np.array([0.05, 0.03, 0.03]),
+        point=striking_point(robot, posture, striker) + np.array(shift),
         normal=[1.0, 0.0, 0.0],
         law=LAW,
         target=FreeMass(mass=3.0),
@@ -64,6 +73,30 @@ def test_it_is_inside_the_limits_and_a_little_faster_is_not() -> None:
     assert _keeps_limits(problem, found.duration, found.speed)
     assert not _keeps_limits(problem, found.duration, 20 * found.speed)
     assert found.describe()["impulse_Ns"] == found.impulse
+
+
+def test_a_slow_reach_keeps_the_limits_beside_a_continuous_joint() -> None:
+    """Its (cos, sin) come last in a configuration, and are no angles of the joints before it."""
+    model, parent = pin.Model(), 0
+    kinds = {"shoulder": pin.JointModelRY, "elbow": pin.JointModelRY, "roll": pin.JointModelRUBX}
+    for name, kind in kinds.items():
+        place = pin.SE3(np.eye(3), np.array([0.4 if parent else 0.0, 0.0, 0.0]))
+        parent = model.addJoint(parent, kind(), place, name)
+        body = pin.Inertia(2.0, np.array([0.1, 0.0, 0.0]), 0.02 * np.eye(3))
+        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
+        model.addFrame(pin.Frame(f"{name} link", parent, 0, pin.SE3.Identity(), pin.FrameType.BODY))
+    robot = Robot.from_model(
+        model,
+        name="rolling",
+        armature=0.1,
+        torque_limit=200.0,
+        velocity_limit=6.0,
+        position_limit={"shoulder": (-2.5, 0.5), "elbow": (0.7, 2.8)},
+        strikers=[Striker(name="tip", frame="roll link", point=np.array([0.2, 0.0, 0.0]))],
+        postures={"ready": {"shoulder": -1.2, "elbow": 1.8}},
+    )
+    problem = reach_of(robot, "ready", "tip", (0.05, 0.0, 0.0), stance=FixedBase())
+    assert _keeps_limits(problem, 1.0, 0.1)
 
 
 def test_wrenches_exist_only_for_what_soles_can_push() -> None:

@@ -127,6 +127,14 @@ def test_a_plan_that_leads_nowhere_is_not_where_the_next_one_starts(monkeypatch:
     assert [s if isinstance(s, str) else s.result.x[0] for _, s, _ in made.asked] == ["reach", 1, "reach", 3]
 
 
+def test_a_blow_from_the_plan_before_has_one_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`solve` refuses several from a given one; the reach after a failure has them again."""
+    made = Solver(fails_at=(2,))
+    monkeypatch.setattr(blows, "solve", made)
+    drive_nail(nailing(), depth=0.03, starts=3)
+    assert [options.get("starts", 1) for _, _, options in made.asked] == [3, 1, 3, 1]
+
+
 def test_a_nail_that_is_in_on_the_last_step_is_in(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blows, "solve", Solver(drives=lambda nail: 5e-5))
     assert drive_nail(nailing(), depth=0.01 + 4e-5).done

@@ -295,6 +295,8 @@ def test_a_solve_without_a_verdict_gets_another_solvers() -> None:
     old = stopped.run(t.program, start)
     assert old.status is Status.ITERATION_LIMIT
     assert ipopt_retry(stopped, t.program, start, old) is old  # a limit that was asked for is an answer
+    # nobody has asked for a limit with the options of a warm start
+    assert ipopt_retry(budget.near_by(), t.program, start, old).status is Status.SOLVED
     given_up = dataclasses.replace(old, status=Status.FAILED)
     assert ipopt_retry(budget, t.program, start, given_up).status is Status.SOLVED
     solved = budget.run(t.program, start)

@@ -28,6 +28,7 @@ from impactopt import (
 )
 from impactopt.codegen.compiler import find_compiler
 from impactopt.files.problem_file import parse_problem_file
+from impactopt.planning.parameter_changes import moved_problem
 from impactopt.simulation.result import Scene
 from impactopt.simulation.target_dynamics import TargetContact
 
@@ -68,6 +69,13 @@ def test_both_hands_touch_and_part_at_one_instant(solution: Solution) -> None:
     assert hit.forces.shape == (len(hit.time), 2)
     assert (hit.forces[:-1] > 1.0).all() and np.abs(hit.forces[-1]).max() < 1e-6
     np.testing.assert_allclose(hit.forces.sum(axis=1), hit.force)
+
+
+def test_a_moved_point_leaves_the_other_hand_at_its_own(problem: ImpactProblem) -> None:
+    assert problem.second is not None
+    moved = moved_problem(problem, point=problem.point + np.array([0.05, 0.0, 0.05]))
+    points = [moved.point, problem.second.point]
+    np.testing.assert_allclose(places(moved, moved.contact_posture), points, atol=1e-6)
 
 
 @needs_compiler

@@ -280,6 +280,19 @@ def test_who_comes_before_a_leader_leads_it_by_the_inverse_law(tmp_path: Path) -
     assert made.source is not None and "'shoulder' leads" in "; ".join(made.source.notes)
 
 
+@pytest.mark.parametrize("locked", ["shoulder", "elbow"])
+def test_a_locked_leader_or_follower_leaves_the_other_joint_its_own_motor(
+    locked: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "robot.urdf"
+    made = []
+    for text in (urdfs.arm(), urdfs.following(urdfs.arm(), "shoulder", 'joint="elbow" multiplier="2"')):
+        path.write_text(text)
+        made.append(Robot.from_urdf(path, floating=False, locked=("slide_0", "slide_1", locked)))
+    for name in ("kp", "kd", "torque_limit", "velocity_limit"):
+        close(*(getattr(robot, name) for robot in made))
+
+
 @pytest.mark.parametrize(
     ("laws", "said"),
     [

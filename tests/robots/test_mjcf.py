@@ -201,6 +201,39 @@ def test_sites_that_move_strike_and_keyframes_inside_the_limits_are_postures(tre
     assert robot.joint_positions(robot.posture("home")) == pytest.approx([0.3, 0.2, 0.1, 2.0])
 
 
+TWO = """<mujoco><compiler angle="radian"/><worldbody><body>
+<joint name="one" axis="0 1 0" range="-1 1" actuatorfrcrange="-50 50" armature=".1"/>
+<geom size=".1" mass="1"/>
+<body pos=".3 0 0"><joint name="two" axis="0 1 0" range="-1 1" actuatorfrcrange="-50 50" armature=".1"/>
+<geom size=".1" mass="1"/></body></body></worldbody>%s
+<keyframe><key name="far" qpos="0.9 0.9"/><key name="zero" qpos="0 0"/></keyframe></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("more", "options"),
+    [
+        ("", {"position_limit": {"one": (-0.5, 0.5)}}),
+        (
+            '<tendon><fixed name="sum" range="-1 1" limited="true"><joint joint="one" coef="1"/>'
+            '<joint joint="two" coef="1"/></fixed></tendon>',
+            {},
+        ),
+        ('<equality><joint joint1="two" joint2="one" polycoef="0 2 0 0 0"/></equality>', {}),
+    ],
+    ids=["a user's limit", "a tendon", "a follower"],
+)
+def test_a_keyframe_outside_a_narrower_range_is_left_out(
+    more: str, options: dict[str, Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "two.xml"
+    path.write_text(TWO % more)
+    robot = Robot.from_mjcf(path, velocity_limit=5.0, **options)
+    assert list(robot.postures) == ["zero"]
+    assert robot.source is not None and "keyframe 'far' is left out" in "; ".join(robot.source.notes)
+    with pytest.raises(InputError, match="posture 'far': outside its position limits"):
+        Robot.from_mjcf(path, velocity_limit=5.0, postures={"far": {"one": 0.9}}, **options)
+
+
 def test_a_free_joint_can_be_taken_out(tree: Path) -> None:
     robot = Robot.from_mjcf(tree, floating=False, **LACKS)
     assert not robot.floating and robot.n == 4

@@ -175,23 +175,41 @@ def test_friction_and_restitution_vary_too() -> None:
     np.testing.assert_allclose(rigid["impulse_Ns"], (1 + e) * rigid["impulse_Ns"][0], rtol=1e-9)
 
 
-def test_gains_of_one_joint_and_of_all() -> None:
+def test_gains_and_limits_are_the_robots_of_the_file_with_them() -> None:
+    """The default of Kp is 30 1/s times Kd."""
     robot, given = load_robot("planar_arm"), {"posture": "ready", "speed_m_s": 1.0}
-    stiff = float(2 * robot.kd[0])
-    found = [
-        collide_many(arm_file(), {key: [value]}, at_contact=given)["impulse_Ns"][0]
-        for key, value in (("robot.kd", stiff), ("robot.kd.elbow", stiff), ("at_contact.kd_scale", 1.0))
-    ]
+    stiff, weak = float(2 * robot.kd[0]), float(0.5 * robot.torque_limit[0])
+    columns = {"robot.kd": [stiff, robot.kd[0]], "robot.torque_limit.elbow": [weak, robot.torque_limit[0]]}
+    outputs = ("impulse_Ns", "torque_ratio")
+    found = collide_many(arm_file(), columns, outputs=outputs, at_contact=given)
     q = robot.posture("ready")
     v = striking_velocity(robot, q, "hammer", NORMAL, 1.0)
-    one = robot.kd.copy()
-    one[robot.joint_index("elbow")] = stiff
     law = SpringDamper(stiffness=2e4, damping=50.0)
     model = SDC(robot=robot, striker="hammer", normal=NORMAL, law=law, target=FreeMass(mass=0.5))
-    for impulse, kd in zip(found, (stiff, one, robot.kd), strict=True):
-        assert impulse == pytest.approx(
-            model.collide(q, v, holding_torque(robot, q, v), kd=kd).impulse, rel=1e-9
+    for i, (kd, elbow) in enumerate(zip(*columns.values(), strict=True)):
+        limit = robot.torque_limit.copy()
+        limit[robot.joint_index("elbow")] = elbow
+        damping = np.full(robot.n, kd)
+        one = model.collide(
+            q, v, holding_torque(robot, q, v), kd=damping, kp=30 * damping, torque_limit=limit
         )
+        assert one.demand is not None
+        assert found["impulse_Ns"][i] == pytest.approx(one.impulse, rel=1e-9)
+        assert found["torque_ratio"][i] == pytest.approx(np.abs(one.demand / limit).max(), rel=1e-9)
+
+
+def test_gains_of_all_joints_leave_a_soft_grip_as_it_is() -> None:
+    given = {"posture": "ready", "speed_m_s": 1.0}
+    mallet = {"name": "mallet", "frame": "wrist", "mass_kg": 0.5, "center_m": [0.2, 0.0, 0.0]}
+    mallet |= {"inertia_kg_m2": np.diag([1e-3] * 3).tolist(), "head_m": [0.25, 0.0, 0.0]}
+    grip = {"axis": [0.0, 1.0, 0.0], "stiffness_N_m_rad": 10.0, "damping_N_m_s_rad": 0.3}
+    soft = {"preset": "planar_arm", "tools": [mallet], "grips": {"mallet": grip}}
+    data = {**arm_file().data, "robot": soft}
+    data["problem"] = {k: x for k, x in data["problem"].items() if k != "robot"} | {"striker": "mallet"}
+    file = problem_file_from_data(data, where="grip")
+    alone = collide_many(file.changed({"robot.kp": 4000.0}), {}, at_contact=given)
+    swept = collide_many(file, {"robot.kp": [4000.0]}, at_contact=given)
+    assert swept["reason"][0] == "" and swept["impulse_Ns"] == alone["impulse_Ns"]
 
 
 # ---------------------------------------------------------------- states

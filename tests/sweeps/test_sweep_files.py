@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import qmc
+from support.fake_solution import strike_record
 
-from impactopt import InputError
+from impactopt import InputError, holding_torque, planar_arm
+from impactopt.files.output import save_record
 from impactopt.sweeps import Sweep, read_sweep_file, sweep_from_data
 from impactopt.sweeps.design import Axis, Design, Draws, Span
 
@@ -202,3 +204,14 @@ def test_the_hash_is_of_what_is_done_not_of_how_it_is_written(tmp_path: Path) ->
     problem = tmp_path / "arm.toml"
     problem.write_text(problem.read_text().replace("mass_kg = 0.05", "mass_kg = 0.06"), encoding="utf-8")
     assert read_sweep_file(path).hash != first
+
+
+def test_the_hash_is_of_the_saved_result_too(tmp_path: Path) -> None:
+    robot, hashes = planar_arm(), set()
+    q = robot.posture("ready")
+    for rate in (1.0, 1.0, 2.0):
+        v = np.array([0.3, rate, 0.4])
+        save_record(strike_record(robot, q, v, holding_torque(robot, q, v)), tmp_path)
+        data = {"problem": "arm_planar", "case_kind": "collision"}
+        hashes.add(sweep_from_data({"sweep": data, "at_contact": {"result": str(tmp_path)}}).hash)
+    assert len(hashes) == 2

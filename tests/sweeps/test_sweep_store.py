@@ -21,7 +21,7 @@ from impactopt import InputError
 from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.design import Found
 from impactopt.sweeps.store import Entry, Journal, Store
-from impactopt.sweeps.table import merge_kinds, unit_of, write_table
+from impactopt.sweeps.table import merge_kinds, read_columns, unit_of, write_table
 
 
 def same(a: Entry, b: Entry) -> None:
@@ -187,6 +187,45 @@ def test_the_same_sweep_goes_on_and_another_is_refused(tmp_path: Path) -> None:
     Store(sweep(), tmp_path).close()  # the lock is free after a refusal
 
 
+URDF = """<robot name="lever"><link name="base"/><link name="lever"><inertial><mass value="1"/>
+<origin xyz="0.2 0 0"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge" type="revolute"><parent link="base"/><child link="lever"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="100" velocity="8"/></joint></robot>"""
+LEVER = """
+[problem]
+striker = "tip"
+start = "down"
+point_m = [0.35103302, 0.0, -0.19177022]
+normal = [0.0, 0.0, -1.0]
+[target]
+mass_kg = 2.0
+[contact]
+stiffness_N_m = 1e4
+damping_N_s_m = 100.0
+[robot]
+urdf = "lever.urdf"
+floating = false
+armature_kg_m2 = 0.1
+strikers = [{name = "tip", frame = "lever", point_m = [0.4, 0.0, 0.0]}]
+postures_rad.down.hinge = 0.5
+"""
+
+
+def test_rows_of_a_changed_urdf_are_not_mixed_in(tmp_path: Path) -> None:
+    (tmp_path / "lever.toml").write_text(LEVER, encoding="utf-8")
+    (tmp_path / "lever.urdf").write_text(URDF, encoding="utf-8")
+
+    def lever() -> Any:
+        data = {"problem": str(tmp_path / "lever.toml"), "case_kind": "collision"}
+        return sweep_from_data({"sweep": data, "at_contact": {"speed_m_s": 1.0, "posture": "down"}})
+
+    for _ in range(2):
+        Store(lever(), tmp_path / "out").close()
+    (tmp_path / "lever.urdf").write_text(URDF.replace('mass value="1"', 'mass value="4"'), encoding="utf-8")
+    with pytest.raises(InputError, match=r"another sweep: content of robot\.urdf lever\.urdf was .*, is"):
+        Store(lever(), tmp_path / "out")
+
+
 def test_rows_of_other_versions_are_not_mixed_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Store(sweep(), tmp_path).close()
     from impactopt.planning.solution import versions
@@ -200,7 +239,7 @@ def test_results_of_an_older_journal_are_left_as_they_are(tmp_path: Path) -> Non
     Store(sweep(), tmp_path).close()
     (tmp_path / "units.sqlite").rename(tmp_path / "units.journal")
     plate = tmp_path / "sweep.json"
-    plate.write_bytes(plate.read_bytes().replace(b'"format": 2', b'"format": 1'))
+    plate.write_bytes(plate.read_bytes().replace(b'"format": 3', b'"format": 1'))
     with pytest.raises(InputError, match="end this sweep with the version that began it, or give another"):
         Store(sweep(), tmp_path)
     assert not (tmp_path / "units.sqlite").exists()
@@ -268,6 +307,17 @@ def test_small_parts_and_large_ones_become_one_table_with_units(tmp_path: Path) 
     }
     assert table.schema.field("x_m").metadata == {b"unit": b"m"}
     assert table.schema.metadata[b"impactopt.name"] == b"of tests"
+
+
+def test_a_number_that_no_case_has_is_a_column_of_nulls(tmp_path: Path) -> None:
+    # the impulse of a rigid impact has no peak of its force
+    parts: list[Any] = [(0, {"reason": [""], "peak_force_N": [None]}), (1, {"reason": ["bad"]})]
+    kinds: dict[str, str] = {}
+    for _, columns in parts:
+        merge_kinds(kinds, columns)
+    write_table(tmp_path / "t.parquet", parts, kinds, {})
+    assert np.isnan(read_columns(tmp_path / "t.parquet", ["peak_force_N"])["peak_force_N"]).all()
+    assert pq.read_schema(tmp_path / "t.parquet").field("peak_force_N").type == "double"
 
 
 @pytest.mark.parametrize(

@@ -204,10 +204,10 @@ def _check_bolted(first: Description, found: Drafted, ties: Sequence[Tie]) -> No
         )
 
 
-def _read(path: Path, mjcf: bool, floating: bool | None) -> Description:
+def _read(path: Path, mjcf: bool, floating: bool | None, locked: Collection[str] = ()) -> Description:
     if mjcf:
-        return read_mjcf(path, floating=floating)
-    out = read_urdf(path, floating=bool(floating), repaired=True)
+        return read_mjcf(path, floating=floating, locked=locked)
+    out = read_urdf(path, floating=bool(floating), locked=locked, repaired=True)
     lower, upper = out.model.lowerPositionLimit, out.model.upperPositionLimit
     for joint in out.unranged:
         k = out.model.joints[out.model.getJointId(joint)].idx_q
@@ -239,9 +239,9 @@ def _why_locked(tie: Tie) -> str:
 def _made(
     path: Path, mjcf: bool, floating: bool, locked: Mapping[str, str], carrying: Collection[str] = ()
 ) -> Drafted:
-    read = _read(path, mjcf, floating)
+    read = _read(path, mjcf, floating, locked)
     angles = {joint: _rest(read.model, joint) for joint in locked}
-    for tie in read.ties:
+    for tie in _read(path, mjcf, floating).ties:  # whose followers `_locked` has chosen
         if tie.follower in locked:
             angles[tie.follower] = _followed(read.model, tie, angles)
     model = read.moving(angles)

@@ -144,6 +144,21 @@ def test_a_law_of_ones_own() -> None:
         found.toml()
 
 
+def test_a_negative_parameter_has_the_interval_of_its_opposite() -> None:
+    log = log_of(TrueBlow("Kelvin-Voigt", mass=MASS), seed=3)
+
+    def interval(sign: float) -> tuple[float, float]:
+        law = CustomLaw(
+            compression=lambda x, rate, k, d: sign * k * x + d * rate, analytic=True, k=sign * 5e4, d=100.0
+        )
+        k = identify(log, laws=[law]).best.estimates["k"]
+        return k.low, k.high
+
+    low, high = interval(1.0)
+    assert interval(-1.0) == pytest.approx((-high, -low), rel=1e-3)
+    assert low < high
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Saturating(ContactLaw):
     """A spring and a damper; the spring's force approaches a limit."""

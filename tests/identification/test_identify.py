@@ -343,6 +343,24 @@ def test_neither_a_round_top_nor_a_coarse_converter_is_taken_for_a_cut(step: flo
     assert identify(dataclasses.replace(log, force=force), laws=["Kelvin-Voigt"]).clipped == (0,)
 
 
+def test_the_round_top_of_a_dense_log_is_not_taken_for_a_cut() -> None:
+    """500 samples a millisecond, without noise: near its top the half sine hardly changes."""
+    k, begin, period = 1e4, 0.02, np.pi * np.sqrt(MASS / 1e4)
+    t = np.arange(0.0, 0.1, 2e-6)
+    angle = np.pi * np.clip((t - begin) / period, 0.0, 1.0)
+    log = ImpactLog(time=t, force=np.sqrt(k * MASS) * np.sin(angle), speed=np.cos(angle))
+    assert identify(log, laws=["Kelvin-Voigt"]).clipped == (0,)
+
+
+def test_contacts_that_are_too_weak_to_be_fitted_are_told() -> None:
+    log = log_of(TrueBlow("Kelvin-Voigt"), TrueBlow("Kelvin-Voigt", speed=0.15), noise=0.002)
+    found = identify(log, laws=["Kelvin-Voigt"])
+    assert len(found.best.speeds) == 1
+    assert found.weak == pytest.approx([0.08], abs=3e-4)
+    assert any("1 contact with less than 20 %" in caution and "0.08" in caution for caution in found.cautions)
+    assert found.describe()["weak_s"] == list(found.weak)
+
+
 # ---------------------------------------------------------------- command
 def test_the_command_prints_numbers_and_writes_a_section(tmp_path: Path) -> None:
     log, path, out = log_of(TrueBlow("Hunt-Crossley"), seed=3), tmp_path / "blow.csv", tmp_path / "law.toml"

@@ -29,7 +29,7 @@ class Collision:
     impulse : [N s] delivered to the target.
     peak_force : [N] largest contact force; of 'rk4' at the steps; infinite of a rigid impact.
     duration : [s] from contact to separation.
-    energy : [J] given to the target.
+    energy : [J] given to the target, without the work of a board's damping.
     separated : whether the contact ended within the horizon.
     velocity : (nv) Pinocchio's v after the collision.
     configuration : (nq) Pinocchio's q after the collision.

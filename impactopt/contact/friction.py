@@ -21,10 +21,10 @@ TINY = 1e-9  # [m] added to a deflection, whose length has no slope at zero
 class ContactFriction(Described):
     """Coulomb friction between the striking point and the target's surface.
 
-    The tangential force is against the slide v_t, and mu f |v_t| / sqrt(|v_t|^2 + v_s^2): below the slip
-    speed v_s it is less than Coulomb's, so that it has a slope at rest (Andersson, Soderberg, Bjorklund,
-    "Friction models for sliding dry, boundary and mixed lubricated contacts", Tribology International 40,
-    2007).
+    The tangential force f_t on the target is along the slide v_t of the striking point, as that on the point
+    is against it: f_t = mu f v_t / sqrt(|v_t|^2 + v_s^2). Below the slip speed v_s it is less than Coulomb's,
+    so that it has a slope at rest (Andersson, Soderberg, Bjorklund, "Friction models for sliding dry,
+    boundary and mixed lubricated contacts", Tribology International 40, 2007).
     In the paper's equation (17) F_h = [f_r n; 0] becomes [f_r n + f_t; 0].
 
     With a stiffness the surfaces stick by bristles, and swing back: a spring across the normal whose

@@ -438,10 +438,11 @@ def _law_fit(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
     half_width = _standard_errors(jacobian) * float(stdtrit(max(n + m - p, 1), 0.5 + level / 2))
     estimates = {}
     for each, at, half in zip(fit.free, z, half_width, strict=False):
-        low, high = (float(each.value(np.asarray(at + side * half))) for side in (-1, 1))
-        if not each.logarithmic:
-            low = max(low, 0.0) if each.lower == 0 else min(low, high)
-        estimates[each.name] = Estimate(float(each.value(at)), low, max(low, high), each.unit)
+        # the scale of a negative parameter is negative
+        low, high = sorted(float(each.value(np.asarray(at + side * half))) for side in (-1, 1))
+        if each.lower == 0:
+            low = max(low, 0.0)
+        estimates[each.name] = Estimate(float(each.value(at)), low, high, each.unit)
     speeds = []
     for k, impact in enumerate(fit.impacts):
         at, half = fit.speed(k, z), half_width[fit.of_impact(k)][0] * impact.speed

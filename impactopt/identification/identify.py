@@ -33,7 +33,8 @@ def identify(
     impacts together by least squares: `VirtualMass` with unknown parameters and mass, and for each impact an
     unknown speed and instant of touch. Intervals are those of the linearized fit with white noise, whose
     standard deviations follow from the residuals of force and motion. Samples on flat tops, where the
-    sensor's range has cut off the force, are left out. The hand's drives do not act in the model, which holds
+    sensor's range has cut off the force, are left out, and so are impacts with less than 20 % of the largest
+    force. The hand's drives do not act in the model, which holds
     for short impacts. Exponents, and other parameters that may not be 0, are fixed.
 
     Parameters
@@ -61,7 +62,7 @@ def identify(
         measured = log
     else:
         measured = read_log(log, robot=robot, striker=striker, normal=normal)
-    impacts = find_impacts(measured)
+    impacts, weak = find_impacts(measured)
     fits = [fit_law(law, impacts, float(target_mass), level) for law in chosen]
     return Identification(
         log=measured.name,
@@ -69,6 +70,7 @@ def identify(
         samples=sum(len(impact.time) for impact in impacts),
         clipped=tuple(int(impact.clipped.sum()) for impact in impacts),
         top=max(impact.peak for impact in impacts),
+        weak=weak,
         level=level,
         target_mass=float(target_mass),
         model_mass=tuple(impact.model_mass for impact in impacts),

@@ -227,9 +227,11 @@ def _turns(robot: Robot, k: int) -> bool:
 
 
 _MIN_CONTACT_FORCE, _MIN_PEAK = 0.1, 0.2  # of contact, and of an impact's peak, over the log's largest force
+_MIN_REPORTED = 0.02  # of a weaker contact that is reported as left out, over the largest force
 _MIN_SAMPLES = 8  # in contact
 # A top is flat if at least so many samples in a row are within this fraction of the noise, or of the peak.
-_FLAT_SAMPLES, _NOISE_FRACTION, _PEAK_FRACTION = 4, 0.1, 1e-6
+# A force that is cut off is constant to rounding; a round top of a dense log without noise is not.
+_FLAT_SAMPLES, _NOISE_FRACTION, _PEAK_FRACTION = 4, 0.1, 1e-12
 # Except for quantization: within half the length of a quantized top beyond its ends, a parabola falls by 3
 # steps; a force that is cut off falls by more than so many.
 _QUANTIZATION_STEPS = 6.0
@@ -291,8 +293,8 @@ def noise_of(values: Array) -> float:
     return float(np.quantile(np.abs(np.diff(values, 2)), 0.8) / (1.2816 * np.sqrt(6)))
 
 
-def find_impacts(log: ImpactLog) -> tuple[MeasuredImpact, ...]:
-    """Finds the impacts in a log.
+def find_impacts(log: ImpactLog) -> tuple[tuple[MeasuredImpact, ...], tuple[float, ...]]:
+    """Finds the impacts in a log, and the times [s] of contacts that are too weak to be fitted.
 
     Raises
     ------
@@ -313,7 +315,12 @@ def find_impacts(log: ImpactLog) -> tuple[MeasuredImpact, ...]:
     spans = _spans(log.force, max(_MIN_CONTACT_FORCE * peak, 4.5 * noise))
     spans = [span for span in spans if log.force[slice(*span)].max() > _MIN_PEAK * peak]
     clipped = _clipped(log.force)
-    return tuple(_impact(log, span, spans, noise, clipped) for span in spans)
+    weak = tuple(
+        float(log.time[begin])
+        for begin, end in _spans(log.force, max(_MIN_REPORTED * peak, 8 * noise))
+        if log.force[begin:end].max() <= _MIN_PEAK * peak and end - begin >= _MIN_SAMPLES
+    )
+    return tuple(_impact(log, span, spans, noise, clipped) for span in spans), weak
 
 
 def _spans(force: Array, least: float) -> list[tuple[int, int]]:

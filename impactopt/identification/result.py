@@ -10,7 +10,7 @@ import numpy as np
 
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
-from impactopt.errors import InputError
+from impactopt.errors import InputError, counted
 from impactopt.files.toml import write_toml
 from impactopt.identification.free_parameters import MASS
 
@@ -19,6 +19,7 @@ _DIGITS = 5  # of parameters in a file
 _MAX_CORRELATION = 4.0  # of white noise, in standard deviations
 _INTERPOLATION_ERROR = 0.05  # [% of the peak] residual of a log without noise
 _LIGHT = 0.05  # [kg] no robot's effective mass is less
+_LISTED = 5  # times of contacts that are left out
 _TIE = 10.0  # difference of AIC below which a log cannot distinguish laws
 
 
@@ -138,6 +139,7 @@ class Identification:
     level : of the intervals
     target_mass [kg] : infinite for a fixed target
     clipped, top [N] : number of samples of each impact whose force was cut off at `top`, and is not fitted
+    weak : times [s] of contacts with less than 20 % of the largest force, which are not fitted
     model_mass [kg] : effective mass of each impact by the robot's model; nan if unknown
     """
 
@@ -148,6 +150,7 @@ class Identification:
     target_mass: float
     clipped: tuple[int, ...]
     top: float
+    weak: tuple[float, ...] = ()
     model_mass: tuple[float, ...] = field(default=())
 
     def __repr__(self) -> str:
@@ -181,6 +184,13 @@ class Identification:
                 f"the force is cut off at {self.top:.4g} N: {sum(self.clipped)} samples of "
                 f"{sum(count > 0 for count in self.clipped)} of {len(self.clipped)} impacts are left out; "
                 "peak and impulse of the log are too small: log again with a sensor of a larger range"
+            )
+        if self.weak:
+            times = ", ".join(f"{t:.4g}" for t in self.weak[:_LISTED])
+            more = " ..." if len(self.weak) > _LISTED else ""
+            out.append(
+                f"{counted(len(self.weak), 'contact')} with less than 20 % of the largest force left out, at "
+                f"{times}{more} s: give such impacts a log of their own"
             )
         near = [each.name for each in self.fits[1:] if each.aic - best.aic < _TIE]
         if near:
@@ -219,6 +229,7 @@ class Identification:
             "blows": len(self.best.speeds),
             "samples": self.samples,
             "clipped": list(self.clipped),
+            "weak_s": list(self.weak),
             "level": self.level,
             "target_mass_kg": self.target_mass if np.isfinite(self.target_mass) else None,
             "model_mass_kg": [x for x in self.model_mass if np.isfinite(x)],

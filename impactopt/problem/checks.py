@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.world import Ground, Obstacle, TargetBody
 from impactopt.contact.friction import check_friction, moves_target
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
-from impactopt.contact.targets import FreeMass, RigidWall, Target
+from impactopt.contact.targets import Board, FreeMass, RigidWall, Target
 from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN, is_order
 from impactopt.errors import (
     MANY,
@@ -243,11 +243,6 @@ def check_collision(problem: Any) -> None:
             f"{type(problem.law).__name__}"
         )
     check_friction("friction", problem.friction, problem.target)
-    if moves_target(problem.friction) and any(isinstance(o, TargetEnergy) for o in problem.objectives):
-        raise InputError(
-            "objectives: TargetEnergy is of motion along the normal, and friction's moves_target adds some "
-            "across it: leave one of them out"
-        )
     if problem.friction is not None and problem.collision != "full":
         raise InputError(
             f'friction: the model {problem.collision!r} of the collision has none: take collision="full", or '
@@ -268,6 +263,22 @@ def check_collision(problem: Any) -> None:
                 f"restitution, as KelvinVoigt or HuntCrossley, not {type(law).__name__}: hammer and nail "
                 "approach and part several times in one blow"
             )
+
+
+def check_energy(problem: Any) -> None:
+    """InputError for the objective `TargetEnergy` where the target's energy is not all that it absorbs."""
+    if not any(isinstance(o, TargetEnergy) for o in problem.objectives):
+        return
+    if isinstance(problem.target, Board) and problem.target.damping:
+        raise InputError(
+            "objectives: TargetEnergy lacks the work of a board's damping: give the Board damping=0, or "
+            "another objective"
+        )
+    if moves_target(problem.friction):
+        raise InputError(
+            "objectives: TargetEnergy is of motion along the normal, and friction's moves_target adds some "
+            "across it: leave one of them out"
+        )
 
 
 def check_touches(problem: Any) -> None:

@@ -46,6 +46,7 @@ from impactopt.problem.checks import (
     check_at_rest,
     check_collision,
     check_elements,
+    check_energy,
     check_gains,
     check_hands,
     check_hinges,
@@ -210,8 +211,10 @@ class ImpactProblem:
             partial(check_stance, self)
         )
         stance = stance and mistakes.attempt(self._check_start)
-        for check in (check_elements, check_prices, check_collision, check_touches):
+        for check in (check_elements, check_prices):
             mistakes.attempt(partial(check, self))
+        collision = mistakes.attempt(partial(check_collision, self))
+        mistakes.attempt(partial(check_touches, self))
         if mistakes.attempt(self._check_scenarios):
             for scenario in self.scenarios:
                 mistakes.attempt(partial(scenario.numbers, self.law, self.target))
@@ -221,7 +224,8 @@ class ImpactProblem:
         if terms:
             for term in self.terms:
                 mistakes.attempt(partial(check_names, self.robot, term))
-        mistakes.attempt(self._check_objectives)
+        if mistakes.attempt(self._check_objectives) and collision:
+            mistakes.attempt(partial(check_energy, self))
         sound = striker and stance and terms and mistakes.attempt(partial(check_second, self))
         if sound:
             mistakes.attempt(partial(check_hands, self))

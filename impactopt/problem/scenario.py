@@ -85,7 +85,7 @@ def check_second(problem: Any) -> None:
         raise InputError(
             f"two strikers hit a FreeMass or a RigidWall, not a {type(p.target).__name__}, which takes one"
         )
-    for thing in (*p.terms, *p.objectives):
+    for thing in (*(term for term in p.terms if term.active), *p.objectives):
         if isinstance(thing, (HitCone, HitRegion, Slide, PeakForce, Penetration)) or (
             getattr(thing, "first_instant", False)
         ):

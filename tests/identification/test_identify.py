@@ -144,6 +144,21 @@ def test_a_law_of_ones_own() -> None:
         found.toml()
 
 
+def test_a_negative_parameter_has_the_interval_of_its_opposite() -> None:
+    log = log_of(TrueBlow("Kelvin-Voigt", mass=MASS), seed=3)
+
+    def interval(sign: float) -> tuple[float, float]:
+        law = CustomLaw(
+            compression=lambda x, rate, k, d: sign * k * x + d * rate, analytic=True, k=sign * 5e4, d=100.0
+        )
+        k = identify(log, laws=[law]).best.estimates["k"]
+        return k.low, k.high
+
+    low, high = interval(1.0)
+    assert interval(-1.0) == pytest.approx((-high, -low), rel=1e-3)
+    assert low < high
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Saturating(ContactLaw):
     """A spring and a damper; the spring's force approaches a limit."""
@@ -326,6 +341,24 @@ def test_neither_a_round_top_nor_a_coarse_converter_is_taken_for_a_cut(step: flo
     log = log_of(TrueBlow("Kelvin-Voigt"), noise=0.0, rate=3e4)
     force = np.round(log.force / step) * step if step else log.force
     assert identify(dataclasses.replace(log, force=force), laws=["Kelvin-Voigt"]).clipped == (0,)
+
+
+def test_the_round_top_of_a_dense_log_is_not_taken_for_a_cut() -> None:
+    """500 samples a millisecond, without noise: near its top the half sine hardly changes."""
+    k, begin, period = 1e4, 0.02, np.pi * np.sqrt(MASS / 1e4)
+    t = np.arange(0.0, 0.1, 2e-6)
+    angle = np.pi * np.clip((t - begin) / period, 0.0, 1.0)
+    log = ImpactLog(time=t, force=np.sqrt(k * MASS) * np.sin(angle), speed=np.cos(angle))
+    assert identify(log, laws=["Kelvin-Voigt"]).clipped == (0,)
+
+
+def test_contacts_that_are_too_weak_to_be_fitted_are_told() -> None:
+    log = log_of(TrueBlow("Kelvin-Voigt"), TrueBlow("Kelvin-Voigt", speed=0.15), noise=0.002)
+    found = identify(log, laws=["Kelvin-Voigt"])
+    assert len(found.best.speeds) == 1
+    assert found.weak == pytest.approx([0.08], abs=3e-4)
+    assert any("1 contact with less than 20 %" in caution and "0.08" in caution for caution in found.cautions)
+    assert found.describe()["weak_s"] == list(found.weak)
 
 
 # ---------------------------------------------------------------- command

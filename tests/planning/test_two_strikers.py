@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from impactopt import (
     Board,
     FreeMass,
+    GearLoad,
     HitCone,
     ImpactProblem,
     InputError,
@@ -271,6 +272,11 @@ def test_a_file_has_the_second_striker(problem: ImpactProblem) -> None:
     assert replace(problem, second=None).hash != problem.hash
     assert problem.describe()["second"]["striker"] == "left_hand"
     assert problem.middle == pytest.approx([0.5, 0.0, 1.0])
+
+
+def test_terms_that_are_off_are_allowed_with_two(problem: ImpactProblem) -> None:
+    off = GearLoad(enabled=False)
+    assert off in replace(problem, terms=(*problem.terms, off)).terms
 
 
 def test_what_two_cannot_do_is_refused(problem: ImpactProblem) -> None:

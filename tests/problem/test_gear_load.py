@@ -40,6 +40,13 @@ GEARS = (GearLoad(limit=1.0), HandOrientation(axis=(1.0, 0.0, 0.0), angle=0.1))
 ENGINES = {"pinocchio": simulate_pinocchio, "mujoco": simulate_mujoco}
 
 
+def test_a_limit_by_joint_is_not_changed_by_its_caller() -> None:
+    limit = {"joint_1": 1.0}
+    load = GearLoad(limit=limit)
+    limit["joint_1"] = 9.0
+    assert load.limit == {"joint_1": 1.0}
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("damping", [0.0, 300.0])
 def test_one_joint_hits_a_spring_and_a_damper(engine: str, damping: float) -> None:

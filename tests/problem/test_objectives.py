@@ -12,11 +12,12 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
-from support.small_plans import OPTIONS, Planned, changed
+from support.small_plans import OPTIONS, Planned, arm_problem, changed
 
 from impactopt import (
     AngularMomentum,
     Balance,
+    Board,
     Effort,
     Impulse,
     InputError,
@@ -199,6 +200,14 @@ def test_objectives_that_make_no_sense_are_refused(
     with pytest.raises(InputError) as caught:
         changed(arm_transcription, objectives=objectives)
     assert all(part in str(caught.value) for part in parts)
+
+
+def test_a_damped_board_has_no_energy_as_an_objective() -> None:
+    """Its energy would lack what the damping takes."""
+    board = Board(mass=0.5, stiffness=2e4, breaking_force=400.0)
+    problem = dataclasses.replace(arm_problem(), target=board, objectives=(TargetEnergy(),))
+    with pytest.raises(InputError, match=r"TargetEnergy lacks the work of a board's damping"):
+        dataclasses.replace(problem, target=dataclasses.replace(board, damping=5.0))
 
 
 def test_a_contact_without_duration_has_no_force(arm_transcription: Transcription) -> None:

@@ -130,7 +130,9 @@ class Target(Described, ABC):
 
     @abstractmethod
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Energy [J] that the target has absorbed: its own, and dissipated work, as against wood."""
+        """Energy [J] that the target has absorbed: its own, and the dissipated work that follows from the
+        state, as a nail's against wood; not that of a board's damping.
+        """
 
     def switches(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
         """Switching functions: their changes of sign separate smooth modes of the motion. Steps end there."""

@@ -103,7 +103,10 @@ class Board(Target):
         return [self._beyond(state, self.parameters if parameters is None else parameters)]
 
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Gain of kinetic energy, and elastic energy; after the break that at the break."""
+        """Gain of kinetic energy, and elastic energy; after the break that at the break.
+
+        The work of the damping is not in it, as it is no function of the state.
+        """
         p = self.parameters if parameters is None else parameters
         beyond, at_break = self._beyond(state, p), p["breaking_force"] / p["stiffness"]
         bent = choose(beyond > 0, at_break + 0.0 * beyond, state[1])

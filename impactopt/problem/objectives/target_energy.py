@@ -16,7 +16,7 @@ from impactopt.problem.objectives.base import WEIGHT, Objective
 class TargetEnergy(Objective):
     """The energy that the target has absorbed at separation, with the work done in it.
 
-    In J: ``Target.energy``.
+    In J: ``Target.energy``. A board with damping is refused, as its energy lacks the work of that.
     """
 
     name: ClassVar[str] = "target energy"

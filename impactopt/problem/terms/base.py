@@ -69,8 +69,9 @@ class Term(Described):
         elif about.direction:
             self._keep_direction(field.name)
         elif about.by_joint and isinstance(value, Mapping):
-            for number in value.values():
-                self._number(field.name, number, about)
+            # a copy, as the caller may change the table later, and the term is frozen
+            table = {name: self._number(field.name, number, about) for name, number in value.items()}
+            object.__setattr__(self, field.name, table)
         elif isinstance(value, (int, float)) or kind.startswith("float"):
             object.__setattr__(self, field.name, self._number(field.name, value, about))
 

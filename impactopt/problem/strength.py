@@ -185,7 +185,7 @@ def drawn_impacts(
     face = striker_face(robot, strength.striker) if with_face else None
     min_face_cosine, most = float(np.cos(FirstTouch().angle)), FirstTouch().depth + MAX_BEYOND
     rng, limb, first = np.random.default_rng(0), np.array(robot.limb(hit.model_frame)), robot.nv - robot.n
-    low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
+    low, high = (limits[limb] for limits in _drawn_ranges(robot))
     low, high = low + LIMIT_MARGIN * (high - low), high - LIMIT_MARGIN * (high - low)
     own = robot.joint_positions(q)[limb]
     # postures with their lines: with the link behind the target's plane, and others that meet it face on
@@ -272,14 +272,24 @@ def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
     return chosen
 
 
+def _drawn_ranges(robot: Robot) -> tuple[Array, Array]:
+    """Lower and upper ends (n,) [rad], [m] between which joints are drawn."""
+    turn = 2 * np.pi
+    low = np.where(np.isfinite(robot.lower), robot.lower, np.minimum(robot.upper, np.pi) - turn)
+    high = np.where(np.isfinite(robot.upper), robot.upper, low + turn)
+    middle = (low + high) / 2
+    return np.maximum(low, middle - turn / 2), np.minimum(high, middle + turn / 2)
+
+
 def random_postures(robot: Robot, striker: str, q: Array, count: int, seed: int = 0) -> Iterator[Array]:
     """A configuration q (nq,) with the joints that move a striker drawn within their limits, several times.
 
-    Joints without limits, or with wider ones, are drawn between -pi and pi.
+    Joints without limits are drawn between -pi and pi, those with more than a turn in the middle turn of
+    their range.
     """
     limb = np.array(robot.limb(robot.striker(striker).model_frame))
     rng, own = np.random.default_rng(seed), robot.joint_positions(q)[limb]
-    low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
+    low, high = (limits[limb] for limits in _drawn_ranges(robot))
     for _ in range(count):
         step = np.zeros(robot.nv)
         step[robot.nv - robot.n + limb] = rng.uniform(low, high) - own

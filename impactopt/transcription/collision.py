@@ -787,7 +787,7 @@ class Collision(ContactParameters):
             force=forces.sum(axis=1),
             forces=forces,
             target_speed=np.array([before, *speed]),
-            torque=np.vstack([self._feedforward().evaluate(x), torque]) * b.robot.torque_limit,
+            torque=np.vstack([self.contact.feedforward[0].evaluate(x), torque]) * b.robot.torque_limit,
             sole_wrench=wrench,
             ground=total_ground_wrench(b.coordinates, wrench),
             outcome=outcome,

@@ -286,7 +286,8 @@ def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Ar
         pairs = [(k, k) for k in range(group.count)]  # vectors, new and old, whose multipliers are the same
         if name.endswith(MODEL_VARIABLES) and _model(t) != _model(old):
             continue
-        if name.split()[0] in nodes and known.count != group.count:
+        # groups of a scenario begin with its name and a colon, and its name may begin with that of a phase
+        if ": " not in name and name.split()[0] in nodes and known.count != group.count:
             before, now = nodes[name.split()[0]]
             # the old nodes are among the new ones; multipliers of added nodes are zero
             pairs = [(int(i), k) for k, i in enumerate(np.flatnonzero(np.isin(now, before)))]

@@ -10,7 +10,7 @@ import numpy as np
 from impactopt.contact.fields import about
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import Measure
-from impactopt.robots.loads import fading
+from impactopt.robots.loads import fading, weight_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +41,9 @@ class GroundForce(Term):
     enabled: bool = field(default=True, metadata=about("false: soles may be unloaded, and land hard"))
 
     def add_constraints(self, program: Any) -> None:
-        legs, weight = program.coordinates.legs, program.builder.limits.weight
+        legs, weight = program.coordinates.legs, weight_of(program.problem.robot)
         soles = [k for k, leg in enumerate(legs) if leg.sole is not None]
-        if not soles:
+        if not soles or not weight:
             return
         p = program.problem
         # soles that touch down or lift off at an end of the phase are unloaded there

@@ -304,8 +304,8 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
         raise InputError(
             f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "
             f"brakes too late: it gives the target {impulse:.3g} N s in the impact, and then presses on it "
-            f"with {pressing:.3g} N s, until {touches[-1, 1] - touches[0, 0]:.2g} s after the first touch; give "
-            "larger limits, or plan with a smaller fraction in [terms.velocity_limit]"
+            f"with {pressing:.3g} N s, until {touches[-1, 1] - touches[0, 0]:.2g} s after the first touch; "
+            "give larger limits, or plan with a smaller fraction in [terms.velocity_limit]"
         )
     smoothing = {
         "acceleration_rad_s2": within.acceleration,

@@ -135,8 +135,8 @@ def _joint(
     at_rest = [np.where(ends, 0.0, most) for most in (fastest, limits.acceleration)]
     upper = [np.where(ends, position, highest), *at_rest, np.full(k, limits.jerk)]
     lower = [np.where(ends, position, lowest), *(-x for x in upper[1:])]
-    # In units that make all numbers of order one, and not by the simplex method, which failed on some programs
-    # of any units.
+    # In units that make all numbers of order one, and not by the simplex method, which failed on some
+    # programs in any units.
     sizes = np.array([POSITION_TIME, 1.0, limits.acceleration, limits.jerk])
     column = np.repeat([*sizes, *sizes[:2]], k)
     equation, inequality = np.repeat(sizes[:3], k - 1), np.repeat(sizes[:2], 2 * k)

@@ -84,7 +84,8 @@ class Solution(solution.Solution):
 
         Raises
         ------
-        InputError : an unknown parameter; this is not a solution, or its KKT system is singular.
+        InputError : an unknown parameter, or one at its bound, such as a nail's depth of 0; this is not a
+            solution, or its KKT system is singular.
         """
         return sensitivity_of(self, parameter)
 

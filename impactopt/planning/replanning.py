@@ -237,10 +237,21 @@ def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
 def _slope(family: ParametricProgram, parameter: Parameter, half: float) -> tuple[Array, Array, Array]:
     """Central differences by a parameter, at fixed variables and multipliers: of the KKT residual
     (n + m + n,), the impulse and the minimized objective.
+
+    Raises
+    ------
+    InputError : the parameter is at a bound, such as a depth of 0.
     """
     x, sides = family.solution.result.x, []
     for value in (parameter.value + half, parameter.value - half):
-        t = family.program_for(parameter.at(value))
+        try:
+            problem = parameter.at(value)
+        except InputError as error:
+            raise InputError(
+                f"sensitivity: central differences need both sides of {parameter.name} = "
+                f"{parameter.value:g}, and one is not allowed ({error}); solve with a value off this bound"
+            ) from error
+        t = family.program_for(problem)
         offset = family.system.offset(t.program)
         residual = np.concatenate([getattr(offset, name) for name in Offset.PARTS])
         sides.append((residual, np.array(t.impulse(x)), np.array(t.program.objective(x))))

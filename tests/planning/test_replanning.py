@@ -207,6 +207,8 @@ def test_what_cannot_be_bent_is_said(arm: Solution) -> None:
         arm.sensitivity("target.mas")
     with pytest.raises(InputError, match=r"terms\.power_limit\.limit: .* give PowerLimit one"):
         arm.sensitivity("terms.power_limit.limit")
+    with pytest.raises(InputError, match=r"both sides of target\.depth = 0, and one is not allowed"):
+        arm.sensitivity("target.depth")
     stopped = dataclasses.replace(arm, result=dataclasses.replace(arm.result, status=Status.ITERATION_LIMIT))
     with pytest.raises(InputError, match="not a solution"):
         stopped.moved(mass=0.06)

@@ -133,6 +133,17 @@ def test_a_plan_and_its_model_agree(met: str, model: str, freezes: int) -> None:
         assert abs(off) > 5 * IMPULSE
 
 
+@pytest.mark.parametrize("model", ["sdc-paper", "sdc"])
+def test_the_servo_keeps_its_torque_in_contact(model: str) -> None:
+    """The paper's model leaves out the torque that balances gravity, but a replay has gravity."""
+    reference = solve(dataclasses.replace(arm_problem(), collision=model)).plan.reference
+    robot, k = arm_problem().robot, int(np.flatnonzero(reference.phase == 1)[0])
+    coasting = robot.inverse_dynamics(
+        robot.model.createData(), reference.q[k], reference.v[k], 0 * reference.v[k]
+    )
+    np.testing.assert_allclose(reference.torque[k], coasting, atol=1e-9 * np.abs(coasting).max())
+
+
 @pytest.mark.parametrize(
     ("name", "model", "freezes"),
     [

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
+from support import urdfs
 
-from impactopt import FirstTouch, HandOrientation, load_problem, solve
+from impactopt import FirstTouch, HandOrientation, Robot, Striker, load_problem, solve
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.strength import MAX_BEYOND, Strength, drawn_impacts, strongest_posture, touches
+from impactopt.problem.strength import (
+    MAX_BEYOND,
+    Strength,
+    drawn_impacts,
+    random_postures,
+    strongest_posture,
+    touches,
+)
 from impactopt.transcription import initial_guess
 
 
@@ -80,3 +90,20 @@ def test_drawn_postures_turn_the_links_face_to_the_normal() -> None:
         assert along.max() <= face.ahead + FirstTouch().depth + MAX_BEYOND + 1e-9
         assert np.linalg.norm(impact.normal) == pytest.approx(1.0, abs=1e-8)
     assert len({np.count_nonzero(impact.normal) for impact in impacts}) == 2
+
+
+def test_joints_far_from_zero_are_drawn_in_their_ranges(tmp_path: Path) -> None:
+    """A gantry's rail begins at 4 m."""
+    drive = {"kind": "prismatic", "effort": 100.0, "velocity": 2.0}
+    rail = urdfs.joint("rail", "base", "hand", "1 0 0", (0.0, 0.0, 0.5), (4.0, 6.0), **drive)
+    links = (urdfs.link(name, 1.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)) for name in ("base", "hand"))
+    (tmp_path / "gantry.urdf").write_text(urdfs.robot("gantry", *links, rail))
+    robot = Robot.from_urdf(
+        tmp_path / "gantry.urdf",
+        floating=False,
+        armature=0.0,
+        strikers=[Striker(name="tip", frame="hand", point=np.zeros(3))],
+        postures={"middle": {"rail": 5.0}},
+    )
+    drawn = np.ravel(list(random_postures(robot, "tip", robot.posture("middle"), 20)))
+    assert drawn.min() >= 4.0 and drawn.max() <= 6.0 and np.ptp(drawn) > 1.0

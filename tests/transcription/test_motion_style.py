@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid, quad, trapezoid
 from scipy.signal import find_peaks
-from support.small_plans import Planned, changed
+from support.small_plans import Planned, biped_problem, changed, transcribed
+from support.small_robots import biped
 
 from impactopt import GroundForce, InputError, talos
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.problem.motion_style import STYLES, MotionPrices
+from impactopt.robots.loads import weight_of
 from impactopt.transcription.motion_measures import ground_force_share, motion_measures
 from impactopt.transcription.objective import cost_of_motion
 from impactopt.transcription.transcription import Transcription
@@ -123,6 +125,18 @@ def test_reversals_are_peaks_and_valleys_by_their_prominence(biped_plan: Planned
 def test_a_robot_at_rest_presses_with_its_weight(biped_plan: Planned) -> None:
     low, high = ground_force_share(biped_plan.problem, biped_plan.trajectory.ground[:1, 2]) or (0.0, 0.0)
     assert low == high == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_weight_is_that_of_the_robots_gravity() -> None:
+    """On Mars a robot at rest presses with all of its weight, too."""
+    robot = biped()
+    robot.model.gravity.linear = np.array([0.0, 0.0, -3.71])
+    t = transcribed(replace(biped_problem(robot), terms=(GroundForce(),)))
+    x = np.random.default_rng(0).standard_normal(t.program.n)
+    row = next(k for k, origin in enumerate(t.program.origins) if origin.term == "ground force")
+    (_, wrench), *_ = t.wrenches()
+    normal = wrench.evaluate(x)[2::6].sum()
+    assert t.program.constraints(x)[row] == pytest.approx(normal / weight_of(robot), rel=1e-12)
 
 
 def test_constraints_of_the_ground_force_are_normal_forces_over_the_weight(biped_plan: Planned) -> None:

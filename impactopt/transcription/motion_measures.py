@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid, trapezoid
 
@@ -31,7 +32,8 @@ def motion_measures(problem: ImpactProblem, reference: Trajectory) -> dict[str, 
     robot, n = problem.robot, problem.robot.n
     rate, acceleration = reference.v[:, -n:], reference.a[:, -n:]
     angle = cumulative_trapezoid(rate, reference.time, axis=0, initial=0.0)
-    ends = [robot.joint_positions(reference.q[k]) for k in (0, -1)]
+    # continuous joints have no angle of their own, but a difference of at most pi
+    apart = pin.difference(robot.model, reference.q[0], reference.q[-1])[-n:]
     before = reference.phase == 0
     power = np.maximum(reference.torque * rate, 0.0).sum(axis=1)[before]
     idle = problem.idle_joints
@@ -43,7 +45,7 @@ def motion_measures(problem: ImpactProblem, reference: Trajectory) -> dict[str, 
         "reversals": float(np.median(reversals)),
         "peak_jerk_rad_s3": float(max((np.abs(j).max() for j in jerk if j.size), default=0.0)),
         "work_J": float(trapezoid(power, reference.time[before])),
-        "end_posture_rad": float(np.abs(ends[1] - ends[0]).max()),
+        "end_posture_rad": float(np.abs(apart).max()),
         "ground_force_share": ground_force_share(problem, reference.ground[:, 2]),
     }
 

@@ -13,6 +13,7 @@ from support.small_plans import BODILESS, biped_problem, transcribed
 from support.small_robots import arm, biped
 
 from impactopt import (
+    Effort,
     FixedBase,
     ImpactProblem,
     InputError,
@@ -104,6 +105,17 @@ def test_a_step_without_the_time_for_it_names_its_phase() -> None:
     longer = found.causes[0].problem
     assert longer is not None and longer.stances[0] == BOTH and longer.stances[2] == landed
     assert longer.stances[1].phase is not None and longer.stances[1].phase.duration[0] > 0.2
+
+
+def test_effort_after_a_stance_phase_has_the_first_node_of_the_swing() -> None:
+    """The objective's value is the trapezoidal sum of all nodes of swing and follow-through."""
+    t = transcribed(stepping(objectives=(Effort(weight=1.0),)))
+    x = t.with_lifted(first_iterate(t))
+    expected = 0.0
+    for profile in t.torque_profiles()[:2]:
+        of_node = [np.sum(tau.evaluate(x) ** 2) for tau in profile.torques]
+        expected += float(profile.T.evaluate(x)[0] * np.trapezoid(of_node, profile.nodes))
+    assert t.achieved(x)["effort"] == pytest.approx(expected)
 
 
 def test_derivatives_are_those_of_differences(program: Transcription) -> None:

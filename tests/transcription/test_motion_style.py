@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid, quad, trapezoid
 from scipy.signal import find_peaks
-from support.small_plans import Planned, biped_problem, changed, transcribed
+from support.small_plans import Planned, arm_problem, biped_problem, changed, transcribed
 from support.small_robots import biped
 
 from impactopt import GroundForce, InputError, talos
@@ -18,6 +18,7 @@ from impactopt.problem.motion_style import STYLES, MotionPrices
 from impactopt.robots.loads import weight_of
 from impactopt.transcription.motion_measures import ground_force_share, motion_measures
 from impactopt.transcription.objective import cost_of_motion
+from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.transcription import Transcription
 
 
@@ -106,6 +107,25 @@ def test_measures_are_those_of_the_reference(biped_plan: Planned) -> None:
     weight = 9.81 * sum(body.mass for body in problem.robot.model.inertias)
     assert low * weight == pytest.approx(reference.ground[:, 2].min())
     assert high * weight == pytest.approx(reference.ground[:, 2].max())
+
+
+def test_a_continuous_joint_that_passes_half_a_turn_ends_near_its_start() -> None:
+    problem, time = arm_problem(), np.array([0.0, 1.0])
+    robot, still = problem.robot, np.zeros((2, problem.robot.nv))
+    q = robot.angles.put(np.empty((2, robot.nq)), [[3.1, 0.3, 1.2, 0.3], [3.2, 0.3, 1.2, 0.3]])
+    reference = Trajectory(
+        time=time,
+        phase=np.array([0, 2]),
+        q=q,
+        v=still,
+        a=still,
+        torque=still,
+        ground=np.zeros((2, 6)),
+        contact_start=0.5,
+        contact_end=0.5,
+        end=1.0,
+    )
+    assert motion_measures(problem, reference)["end_posture_rad"] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -17,7 +17,8 @@ from impactopt.problem.objectives.base import WEIGHT, Objective
 class Effort(Objective):
     """Cost: integral of (torque / limit)^2 over swing and follow-through, summed over joints.
 
-    In s, by the trapezoidal rule on the nodes. It is meant as a secondary objective with a small weight.
+    In s, by the trapezoidal rule on the nodes; stance phases before and after them are not counted. It is
+    meant as a secondary objective with a small weight.
     """
 
     name: ClassVar[str] = "effort"
@@ -33,16 +34,19 @@ class Effort(Objective):
     def quantity(self, program: Any) -> Any:
         """Trapezoidal sum of T sum(tau^2), which is a lifted variable at each node."""
         swing, follow = program.torque_profiles()[:2]
-        slots = [[tau, swing.T] for tau in swing.torques[1:]] + [[tau, follow.T] for tau in follow.torques]
+        # from rest the torque at the start is constant; after a stance phase it is a variable
+        known = int(not swing.torques[0].cols.size)
+        slots = [[tau, swing.T] for tau in swing.torques[known:]] + [
+            [tau, follow.T] for tau in follow.torques
+        ]
         at = program.add_block("effort", slots, np.zeros(0))
-        places = [*map(swing.place_at, swing.nodes[1:]), *map(follow.place_at, follow.nodes)]
-        labels = [
-            place.name for place in places
-        ]  # by these names a program with more nodes maps the variables
+        places = [*map(swing.place_at, swing.nodes[known:]), *map(follow.place_at, follow.nodes)]
+        # by these names a program with more nodes maps the variables
+        labels = [place.name for place in places]
         of_node = program.lift("effort of a node", at + np.arange(len(slots)), labels=labels)[0]
-        first, *of_swing = trapezoid(swing.nodes)
-        weights = np.array([*of_swing, *trapezoid(follow.nodes)])
-        at_start = first * float(np.sum(swing.torques[0].const ** 2))  # the torque at the start is constant
+        of_swing = trapezoid(swing.nodes)
+        weights = np.array([*of_swing[known:], *trapezoid(follow.nodes)])
+        at_start = known * of_swing[0] * float(np.sum(swing.torques[0].const ** 2))
         return of_node.apply(weights[None]) + swing.T * at_start
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, check_array, check_choice, check_kind, check_number, check_whole
@@ -170,17 +171,32 @@ def _step_error(
     if simulation.missed or (until == np.inf and step <= own):
         return np.nan
     for other in (own if step > own else 2 * step, step / 2):
+        # an engine rounds the time at which it ends to steps; up to `last` there are both simulations
+        longest = max(step, other)
+        last = min(until, options.get("until", np.inf) - longest)
         try:
-            # only to shortly after the impact, up to which impulses are compared
-            shorter = {"step": other, "until": min(until, options.get("until", np.inf))}
-            compared = run(*given, **{**options, **shorter})
+            compared = run(*given, **{**options, "step": other, "until": last + longest})
         except InputError:
             continue  # twice the step may be too long for the servo
-        impulses = [sum(touch[2] for touch in s.touches if touch[0] <= until) for s in (simulation, compared)]
+        impulses = [_impulse_until(s, last) for s in (simulation, compared)]
         largest = max(impulses)
         return abs(impulses[0] - impulses[1]) / largest if largest > 0 else np.nan
     # all steps tried diverge
     return np.inf
+
+
+def _impulse_until(simulation: Simulation, last: float) -> float:
+    """Impulse [N s] up to a time [s], at which a touch may last."""
+    time, force = simulation.contact_time, simulation.contact_force
+    impulse = cumulative_trapezoid(force, time, initial=0.0) if len(time) else force
+    total = 0.0
+    for start, end, whole in simulation.touches:
+        if end <= last:
+            total += whole
+        elif start < last:
+            before, now, after = np.interp([start, last, end], time, impulse)
+            total += whole * (now - before) / (after - before)
+    return total
 
 
 def check_steps(simulation: Simulation, step: float | None) -> None:

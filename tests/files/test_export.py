@@ -293,6 +293,17 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
         arm.export("csv", tmp_path / "none", smooth=(0.0, 1.0))
 
 
+@pytest.mark.parametrize("rate", [200.0, 50.0])
+def test_a_smoothed_motion_ends_at_rest_at_any_rate(arm: Solution, tmp_path: Path, rate: float) -> None:
+    """At the first sample at or after its end, which is 0.1 s after the plan's."""
+    columns = read_csv(arm.export("csv", tmp_path / "csv", rate=rate, smooth=(60.0, 5000.0))[1])
+    time, end = columns["time [s]"], arm.trajectory.end + 0.1
+    assert end - 1e-9 <= time[-1] < end + 1 / rate
+    np.testing.assert_allclose(np.diff(time), 1 / rate, atol=1e-9)
+    for what in ("velocity", "acceleration"):
+        np.testing.assert_allclose(table(columns, what)[1][-1], 0.0, atol=1e-9)
+
+
 def test_mcap_is_what_ros_reads(arm: Solution, tmp_path: Path) -> None:
     _, path = arm.export("mcap", tmp_path / "bag")
     messages = read_mcap(path)

@@ -329,6 +329,19 @@ def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[
         assert ("the board breaks" in labels) == isinstance(target, Board)
 
 
+def test_a_touch_that_lasts_longer_than_what_is_compared_is_no_error_of_the_steps() -> None:
+    """A point mass that is pushed back to a wall 11 ms after the blow, and stays there."""
+    robot, back = slider(1.0), 50.0
+    times = [0.0, 0.1, 0.1, 0.13]
+    ref = reference(times, np.zeros(1), torque=[[15.0], [15.0], [back], [back]], nv=1, n=1)
+    law = KelvinVoigt(stiffness=2e6, damping=2000.0)
+    there = scene(point=np.array([0.075, 0.0, 0.0]), law=law, target=RigidWall())
+    done = with_step_error(simulate_pinocchio, robot, ref, there, step=1e-4, settle=0.0)
+    (_, end, _), (again, stays, _) = done.touches
+    assert 5e-3 < again - end < 0.02 < stays - end
+    assert done.step_error < 1e-3
+
+
 # ---- where the target is
 
 

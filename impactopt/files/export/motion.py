@@ -82,7 +82,7 @@ def motion_at(
     jumps : add both sides of the reference's jumps to the samples, `JUMP` apart; else there are samples at
         multiples of 1 / rate only.
     """
-    reference = _with_rest_at_end(reference)
+    reference = _with_rest_at_end(reference, 1 / rate)
     # multiples of 1 / rate, to the first one at or after the end, where the robot is at rest
     grid = np.arange(int(np.ceil(reference.end * rate - 1e-9)) + 1) / rate
     grid = grid if not jumps else np.append(grid[grid < reference.end - JUMP], reference.end)
@@ -147,17 +147,18 @@ def with_passive_at_rest(motion: Motion, passive: NDArray[np.bool_]) -> Motion:
     return dataclasses.replace(motion, **fixed)
 
 
-def _with_rest_at_end(reference: Trajectory) -> Trajectory:
-    """The reference with its last instant, at rest, at `end` exactly, and once more after it.
+def _with_rest_at_end(reference: Trajectory, period: float) -> Trajectory:
+    """The reference with its last instant, at rest, at `end` exactly, and once more after a `period` [s].
 
-    So the curve ends there. Through instants before and after `end` it would not be at rest.
+    So the curve ends there. Through instants before and after `end` it would not be at rest. The first
+    multiple of the period after `end` is in it.
     """
     fields = {f.name: getattr(reference, f.name) for f in dataclasses.fields(reference)}
     histories = {name: value for name, value in fields.items() if np.ndim(value)}
     before = int(np.searchsorted(reference.time, reference.end - JUMP))
     if before < len(reference.time):
         histories = {name: np.concatenate([x[:before], x[-1:], x[-1:]]) for name, x in histories.items()}
-        histories["time"][-2:] = reference.end, max(reference.time[-1], reference.end + JUMP)
+        histories["time"][-2:] = reference.end, max(reference.time[-1], reference.end + period + JUMP)
     return dataclasses.replace(reference, **histories)
 
 

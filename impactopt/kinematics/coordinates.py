@@ -37,6 +37,8 @@ from impactopt.robots.tools import check_held
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+# [rad] at the start and in a plan, of a base that floats freely: near pi/2 roll and yaw turn about one axis
+MAX_START_PITCH, MAX_PITCH = 1.2, 1.4
 # Newton's method for a leg's inverse kinematics
 _MAX_STEPS = 50
 _LARGEST_STEP = 0.3  # [rad] of a joint

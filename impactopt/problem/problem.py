@@ -35,7 +35,7 @@ from impactopt.errors import (
     check_kind,
     check_name,
 )
-from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.coordinates import MAX_START_PITCH, StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance
 from impactopt.kinematics.support import support_polygon
@@ -283,6 +283,11 @@ class ImpactProblem:
         self.robot.check_stance(posture, [sole.name for sole in self.soles])
         first = self.stance_coordinates[0]
         check_at_rest(self.robot, first, [sole.name for sole in first.soles], posture)
+        if first.drifts and abs(first.start[4]) > MAX_START_PITCH:
+            raise InputError(
+                f"the start posture's base is pitched by {first.start[4]:.2f} rad; a robot that floats "
+                f"freely may start with at most {MAX_START_PITCH:g}: turn start, point, normal and gravity"
+            )
 
     @property
     def style_prices(self) -> MotionPrices:

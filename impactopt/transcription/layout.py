@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError
-from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.coordinates import MAX_PITCH, StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
     Balance,
@@ -437,7 +437,6 @@ GRAVITY = 9.81  # [m/s^2] for the robot's weight, which scales forces; its model
 # 40 to 57 iterations
 LEVER = 0.1
 # [m, rad] largest deviation of the base from its start: of a robot on soles, and of a free-floating one
-# Pitch stays below pi/2, where roll and yaw turn about one axis and their rates are not defined.
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])
 FREE_BOX = np.array([10.0, 10.0, 10.0, 3.0, 1.2, 3.0])
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -469,6 +468,11 @@ class Limits:
         box, y0 = (FREE_BOX if c.drifts else BASE_BOX)[: c.base], c.start
         self.y_lower = np.concatenate([y0[: c.base] - box, lower[c.independent]])
         self.y_upper = np.concatenate([y0[: c.base] + box, upper[c.independent]])
+        if c.drifts:
+            self.y_lower[4], self.y_upper[4] = (
+                max(self.y_lower[4], -MAX_PITCH),
+                min(self.y_upper[4], MAX_PITCH),
+            )
         self.legs_lower, self.legs_upper = lower[c.dependent], upper[c.dependent]
         self.rate_limit = self.velocity.most(r)
         self.units = np.array([self.weight, LEVER])

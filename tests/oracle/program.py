@@ -324,8 +324,8 @@ class Program:
         if term is None or not term.enabled:
             return
         c, base, last = self.problem.coordinates, self.robot.base, len(blow.stages) - 1
-        lower = np.where(r.hinges, -np.inf, r.lower + term.margin)
-        upper = np.where(r.hinges, np.inf, r.upper - term.margin)
+        lower = np.where(r.passive, -np.inf, r.lower + term.margin)
+        upper = np.where(r.passive, np.inf, r.upper - term.margin)
         kept = np.isfinite(lower) | np.isfinite(upper)
 
         def independent(v: Variables) -> Array:

@@ -216,5 +216,9 @@ def test_what_it_is_not_for(thrown: Solution) -> None:
         replace(problem, scenarios=(late,))
     with pytest.raises(InputError, match="floats freely, and the whole-body controller"):
         thrown.validate(engine="mujoco", controller="wbc")
+    start = problem.start_posture.copy()
+    start[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0)).coeffs()
+    with pytest.raises(InputError, match=r"base is pitched by 1\.57 rad"):
+        replace(problem, start=start)
     with pytest.raises(InputError, match=r"gravity \[m/s2\]"):
         space_arm(gravity=[0.0, 0.0])

@@ -21,7 +21,8 @@ class ContactWrenchCone(Term):
     name: ClassVar[str] = "contact wrench cone"
     unit: ClassVar[str] = "of weight"
     friction: float = field(
-        default=0.6, metadata=about("friction coefficient that the plan may use", above=0)
+        default=0.6,
+        metadata=about("friction coefficient that the plan may use along each axis of the sole", above=0),
     )
     margin: float = field(
         default=0.02,

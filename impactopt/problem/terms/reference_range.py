@@ -22,8 +22,8 @@ class ReferenceRange(Term):
     """The servo's reference stays inside the joints' position limits until contact ends.
 
     During contact the reference coasts at the rates at contact, while the target brakes the robot. So in a
-    long contact it moves farther than the joints, and a robot's controller would clip it. Hinges of soles
-    have no reference.
+    long contact it moves farther than the joints, and a robot's controller would clip it. Joints without a
+    motor, hinges of soles and soft grips, have no reference.
 
     The term holds with its defaults in every problem. Its constraints are added once a plan violates them, or
     from the start if the problem gives the term, also in strikes.
@@ -37,8 +37,8 @@ class ReferenceRange(Term):
     enabled: bool = field(default=True, metadata=about("false: the reference is not bounded"))
 
     def limits(self, robot: Any) -> tuple[Any, Any]:
-        """Least and largest angles (n,) of the reference [rad], infinite for hinges."""
-        margin = np.where(robot.hinges, -np.inf, self.margin)
+        """Least and largest angles (n,) of the reference [rad], infinite for joints without a motor."""
+        margin = np.where(robot.passive, -np.inf, self.margin)
         return robot.lower + margin, robot.upper - margin
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:

@@ -293,6 +293,17 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
         arm.export("csv", tmp_path / "none", smooth=(0.0, 1.0))
 
 
+def test_a_smoothed_motion_that_presses_on_is_told(arm: Solution, tmp_path: Path) -> None:
+    """Low accelerations brake behind the target's surface: what the arm presses there is no impact."""
+    meta, path = arm.export("csv", tmp_path / "csv", smooth=(15.0, 2000.0))
+    told = json.loads(meta.read_text())["smooth"]
+    whole = replayed(arm.problem, from_csv(path, arm.problem.robot)).impulse
+    assert told["pressing_Ns"] > 0.1 * whole and told["pressing_ms"] > 50
+    assert told["impulse_Ns"] + told["pressing_Ns"] == pytest.approx(whole, rel=2 * NEAR)
+    with pytest.raises(InputError, match=r"brakes too late: .* then presses on it"):
+        arm.export("csv", tmp_path / "late", smooth=(30.0, 500.0))
+
+
 @pytest.mark.parametrize("rate", [200.0, 50.0])
 def test_a_smoothed_motion_ends_at_rest_at_any_rate(arm: Solution, tmp_path: Path, rate: float) -> None:
     """At the first sample at or after its end, which is 0.1 s after the plan's."""

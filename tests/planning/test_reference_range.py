@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.small_plans import Planned, arm_problem
 
-from impactopt import GearLoad, ReferenceRange, solve
+from impactopt import GearLoad, ReferenceRange, load_problem, solve
 from impactopt.planning import lazy_constraints
 from impactopt.planning.lazy_constraints import reference_beyond
 from impactopt.problem import problem as problems
@@ -42,3 +42,12 @@ def test_a_leg_that_leaves_its_range_between_nodes_gets_nodes_there(
     known = set(nodes_to_add(plan, NO_MORE).swing)
     monkeypatch.setattr(mesh, "inside", lambda robot, margin: (robot.lower, upper))
     assert set(nodes_to_add(plan, NO_MORE).swing) > known
+
+
+def test_joints_without_a_motor_have_no_reference() -> None:
+    """As a hammer's soft grip, which is held by a spring."""
+    robot = load_problem("nailing").robot
+    grip = list(robot.joint_names).index("hammer_grip")
+    lower, upper = ReferenceRange().limits(robot)
+    assert lower[grip] == -np.inf and upper[grip] == np.inf
+    assert np.isfinite(np.delete(lower, grip)).all()

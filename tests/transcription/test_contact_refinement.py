@@ -207,6 +207,15 @@ def test_finer_elements_start_where_the_old_ones_ended(biped_plan: Planned) -> N
     assert (new.program.x_lower[new.expected.f.index(0)] == 0.0).all()
 
 
+def test_a_scenario_may_be_called_like_a_phase(transcription: Transcription) -> None:
+    t = changed(transcription, scenarios=(Scenario(name="swing heavier", mass=8.0),))
+    x, none = first_iterate(t), (np.zeros(t.program.m), np.zeros(t.program.n))
+    new = Transcription(t.problem, t.coordinates, t.functions, elements=halved(t.hit.elements))
+    found = warm_start(new, t, x, *none)[0]
+    group, known = (p.layout.groups["swing heavier: contact force"] for p in (new, t))
+    assert group.count > known.count and np.isfinite(group.read(found)).all()
+
+
 def test_the_old_contact_is_a_warm_start(transcription: Transcription) -> None:
     t = changed(transcription, collision_elements=((0.25,) * 4, (0.25,) * 4))
     first = solve_ipm(t.program, first_iterate(t))

@@ -87,7 +87,7 @@ def export(
             typer.echo(printable(str(path)))
         if cost is not None:
             meets = f"; it meets other bodies {cost['touches']} times" if cost["touches"] else ""
-            if cost["pressing_ms"]:
+            if cost["pressing_ms"] >= 1:
                 meets = (
                     f", and presses on the target for {cost['pressing_ms']:.0f} ms after the impact, with "
                     f"{cost['pressing_Ns']:.3g} N s{meets}"

@@ -265,8 +265,8 @@ class SteppedModel(CollisionModel):
             return
         names = ", ".join(np.array(self.robot.joint_names)[grips])
         raise InputError(
-            f"{names}: {type(self).__name__} has no spring of a soft grip that moves at contact, only a "
-            "servo whose reference moves with it: take FullDynamics ([at_contact] model, or --model: 'full')"
+            f"{names}: in {type(self).__name__} the rest angle of a soft grip's spring would move with the "
+            "joint, and the grip moves at contact: take FullDynamics ([at_contact] model, or --model: 'full')"
         )
 
     @cached_property

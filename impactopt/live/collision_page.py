@@ -20,13 +20,13 @@ from impactopt.live.drawing import Drawing, Moment
 from impactopt.live.requests import LatestRequest
 from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.strength import drawn_ranges
 from impactopt.report.tracks import places_of
 
 Array = NDArray[np.float64]
 _MIN_SPEED, _FIRST_SPEED, _MAX_SPEED = 0.05, 1.0, 4.0  # [m/s]
 _SLIDER_STEPS = 200
 _FREEZES = 4
-_UNLIMITED = np.pi  # [rad] largest angle of the slider of a joint without limits
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,6 +68,10 @@ class CollisionPage(LivePage):
                 "a collision's page has one hand that strikes, without friction, and none that holds on: "
                 "solve it"
             )
+        if problem.robot.sprung.any():
+            raise InputError(
+                "a collision's page has no soft grip, which needs full dynamics: solve the problem"
+            )
         self._y, self._legs = c.split(problem.contact_posture)
         self._polygon = support_polygon(problem.robot, c)
         names = ("robot", "striker", "normal", "law", "target", "stance")
@@ -101,8 +105,9 @@ class CollisionPage(LivePage):
         self.speed = gui.add_slider("speed [m/s]", _MIN_SPEED, _MAX_SPEED, step, _FIRST_SPEED)
         self.joints: dict[str, Any] = {}
         with gui.add_folder("Posture [rad]"):
+            lower, upper = drawn_ranges(robot)
             for k, joint in enumerate(c.independent):
-                low, high = max(robot.lower[joint], -_UNLIMITED), min(robot.upper[joint], _UNLIMITED)
+                low, high = lower[joint], upper[joint]
                 value = float(np.clip(self._y[c.base + k], low, high))
                 step = float(high - low) / _SLIDER_STEPS
                 name = robot.joint_names[joint]

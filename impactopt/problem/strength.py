@@ -185,7 +185,7 @@ def drawn_impacts(
     face = striker_face(robot, strength.striker) if with_face else None
     min_face_cosine, most = float(np.cos(FirstTouch().angle)), FirstTouch().depth + MAX_BEYOND
     rng, limb, first = np.random.default_rng(0), np.array(robot.limb(hit.model_frame)), robot.nv - robot.n
-    low, high = (limits[limb] for limits in _drawn_ranges(robot))
+    low, high = (limits[limb] for limits in drawn_ranges(robot))
     low, high = low + LIMIT_MARGIN * (high - low), high - LIMIT_MARGIN * (high - low)
     own = robot.joint_positions(q)[limb]
     # postures with their lines: with the link behind the target's plane, and others that meet it face on
@@ -272,8 +272,10 @@ def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
     return chosen
 
 
-def _drawn_ranges(robot: Robot) -> tuple[Array, Array]:
-    """Lower and upper ends (n,) [rad], [m] between which joints are drawn."""
+def drawn_ranges(robot: Robot) -> tuple[Array, Array]:
+    """Position limits (n,) [rad], [m] of a turn at most: the middle one of a range, or from -pi to pi without
+    limits.
+    """
     turn = 2 * np.pi
     low = np.where(np.isfinite(robot.lower), robot.lower, np.minimum(robot.upper, np.pi) - turn)
     high = np.where(np.isfinite(robot.upper), robot.upper, low + turn)
@@ -289,7 +291,7 @@ def random_postures(robot: Robot, striker: str, q: Array, count: int, seed: int 
     """
     limb = np.array(robot.limb(robot.striker(striker).model_frame))
     rng, own = np.random.default_rng(seed), robot.joint_positions(q)[limb]
-    low, high = (limits[limb] for limits in _drawn_ranges(robot))
+    low, high = (limits[limb] for limits in drawn_ranges(robot))
     for _ in range(count):
         step = np.zeros(robot.nv)
         step[robot.nv - robot.n + limb] = rng.uniform(low, high) - own

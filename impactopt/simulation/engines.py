@@ -195,7 +195,7 @@ def _impulse_until(simulation: Simulation, last: float) -> float:
             total += whole
         elif start < last:
             before, now, after = np.interp([start, last, end], time, impulse)
-            total += whole * (now - before) / (after - before)
+            total += whole * (now - before) / (after - before) if after > before else 0.0
     return total
 
 

@@ -114,6 +114,10 @@ class Scene:
         """Frames of the model that hit."""
         return (self.striker,) if self.second is None else (self.striker, self.second[0])
 
+    def polygon_of(self, stance: int) -> Array:
+        """Support polygon (c, 2) [m] of a stance phase."""
+        return self.polygons[stance] if self.polygons else self.polygon
+
     def standing_soles(self, stance: int) -> NDArray[np.intp]:
         """Indices of the soles that stand in a stance phase."""
         return np.flatnonzero(self.standing[stance]) if self.standing.size else np.arange(len(self.soles))

@@ -213,8 +213,11 @@ def test_a_recovery_ends_inside_the_soles_which_stay(margin: float) -> None:
 def test_a_recovery_on_one_foot_leaves_the_leg_in_the_air_as_it_is() -> None:
     robot, ref, where = standing_on_left()
     ref.contact_start, ref.contact_end = 0.5, 0.6
-    aside = replace(where, polygon=where.polygon + np.array([0.02, 0.01]))
-    recovery = Recovery(robot, ref, aside, replace(QUIET, recovery_margin=1.0))
+    # its own support, not that of the stance at the impact
+    aside = where.polygon + np.array([0.02, 0.01])
+    world = replace(where, polygon=where.polygon - np.array([0.0, 0.2]), polygons=(aside,))
+    recovery = Recovery(robot, ref, world, replace(QUIET, recovery_margin=1.0))
+    np.testing.assert_allclose(recovery.com_goal, (aside.min(axis=0) + aside.max(axis=0)) / 2, atol=1e-6)
     model, before, data = robot.model, robot.model.createData(), robot.model.createData()
     assert np.abs(recovery.shift).max() > 0.01
     lifted = [6 + k for k, name in enumerate(robot.joint_names) if name.startswith("right")]

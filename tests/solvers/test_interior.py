@@ -137,6 +137,22 @@ def test_many_short_steps_count_as_none(monkeypatch):
     assert next(k for k, r in enumerate(result.history) if r.note == "constraints become elastic") == 3
 
 
+def test_a_search_that_finds_no_point_is_repeated_with_larger_shifts(monkeypatch):
+    """As where rounding refuses a step: constraints need not become elastic for that."""
+    find, shifts = interior_point.LineSearch.find, []
+
+    def refusing(self, problem, step, residual):
+        shifts.append(problem.newton.shift)
+        return None if len(shifts) in (4, 5) else find(self, problem, step, residual)
+
+    monkeypatch.setattr(interior_point.LineSearch, "find", refusing)
+    case = CASES["HS71"]
+    result = solve_ipm(case.build(), case.x0)
+    assert result.status is Status.SOLVED and result.objective == pytest.approx(case.optimum, rel=1e-5)
+    assert shifts[3] < shifts[4] < shifts[5]
+    assert not any("elastic" in record.note for record in result.history)
+
+
 def test_a_failure_restarts_from_the_best_iterate(monkeypatch):
     case = CASES["HS71"]
     advance, calls = interior_point.InteriorRun._advance, []

@@ -199,7 +199,7 @@ def test_gains_and_limits_are_the_robots_of_the_file_with_them() -> None:
 
 
 def test_gains_of_all_joints_leave_a_soft_grip_as_it_is() -> None:
-    given = {"posture": "ready", "speed_m_s": 1.0}
+    given = {"posture": "ready", "speed_m_s": 1.0, "model": "full"}
     mallet = {"name": "mallet", "frame": "wrist", "mass_kg": 0.5, "center_m": [0.2, 0.0, 0.0]}
     mallet |= {"inertia_kg_m2": np.diag([1e-3] * 3).tolist(), "head_m": [0.25, 0.0, 0.0]}
     grip = {"axis": [0.0, 1.0, 0.0], "stiffness_N_m_rad": 10.0, "damping_N_m_s_rad": 0.3}

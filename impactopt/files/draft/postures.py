@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
+from impactopt.problem.strength import drawn_ranges
 from impactopt.robots.build import neutral
 from impactopt.robots.checks import LEG
 from impactopt.robots.loads import weight_of
@@ -248,8 +249,8 @@ def _columns(robot: Robot, joints: Sequence[int]) -> NDArray[np.intp]:
 
 
 def _limits(robot: Robot, own: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Position limits of joints, at most +-pi, tightened by a margin."""
-    low, high = np.maximum(robot.lower[own], -np.pi), np.minimum(robot.upper[own], np.pi)
+    """Position limits of joints, of a turn at most, tightened by a margin."""
+    low, high = (limits[own] for limits in drawn_ranges(robot))
     margin = np.minimum(MARGIN * (high - low) / 2, 0.15)
     return low + margin, high - margin
 

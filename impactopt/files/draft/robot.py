@@ -241,7 +241,7 @@ def _made(
 ) -> Drafted:
     read = _read(path, mjcf, floating, locked)
     angles = {joint: _rest(read.model, joint) for joint in locked}
-    for tie in _read(path, mjcf, floating).ties:  # whose followers `_locked` has chosen
+    for tie in _read(path, mjcf, floating).ties if locked else ():  # their followers `_locked` has chosen
         if tie.follower in locked:
             angles[tie.follower] = _followed(read.model, tie, angles)
     model = read.moving(angles)

@@ -115,8 +115,11 @@ def _clear_fraction(robot: Robot, reference: Any, scene: Scene, shift: Array) ->
     q = postures[instants]
     v, model = np.asarray(reference.v)[instants], robot.model
     data = model.createData()
-    capture = [robot.capture_point(data, *state) for state in zip(q, v, strict=True)]
-    if distance_inside(scene.polygon, np.array(capture)).min() < MIN_CAPTURE_MARGIN:
+    inside = [
+        distance_inside(scene.polygon_of(stance_at(reference, t)), robot.capture_point(data, *state)[None])[0]
+        for t, *state in zip(sampled, q, v, strict=True)
+    ]
+    if min(inside) < MIN_CAPTURE_MARGIN:
         return 1.0
     links = scene.solids.links_between(model, shift)
     required = np.minimum(links.least_distance(model, q), LINK_CLEARANCE)
@@ -127,13 +130,13 @@ def _clear_fraction(robot: Robot, reference: Any, scene: Scene, shift: Array) ->
     return 0.0
 
 
-def _com_goal(scene: Scene, com: Array, margin: float) -> Array:
+def _com_goal(polygon: Array, com: Array, margin: float) -> Array:
     """Point (2,) [m] next to com (2,), towards the soles' centre, with a margin [m] to their edges.
 
     It is the centre, if that has no such margin.
     """
-    centre = (scene.polygon.min(axis=0) + scene.polygon.max(axis=0)) / 2
-    has, most = distance_inside(scene.polygon, np.stack([com, centre]))
+    centre = (polygon.min(axis=0) + polygon.max(axis=0)) / 2
+    has, most = distance_inside(polygon, np.stack([com, centre]))
     # distance from the edges is concave, so this point has at least the margin
     fraction = 1.0 if most <= margin else np.clip((margin - has) / (most - has), 0.0, 1.0)
     return np.asarray(com + fraction * (centre - com))
@@ -149,7 +152,7 @@ def _shifted_posture(robot: Robot, q: Array, q0: Array, scene: Scene, stance: in
     pin.framesForwardKinematics(model, data, q0)
     fixed = [data.oMf[i].copy() for i in soles]
     upright = pin.Quaternion(q[3:7]).toRotationMatrix()
-    goal = _com_goal(scene, np.array(pin.centerOfMass(model, data, q)[:2]), margin)
+    goal = _com_goal(scene.polygon_of(stance), np.array(pin.centerOfMass(model, data, q)[:2]), margin)
     free = np.zeros(robot.nv)  # 1: base and joints between base and soles
     free[:6] = 1.0
     for i in soles:

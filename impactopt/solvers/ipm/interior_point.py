@@ -473,12 +473,8 @@ class InteriorRun(Run[IPMOptions]):
 
     def _advance(self, residual: Vector) -> str | Status:
         """Move to the next iterate: a remark for the history, or the status that ends the solve."""
-        problem, begin = self._problem, self.report.elapsed()
-        step = problem.step(residual)
-        self.report.seconds_qp += self.report.elapsed() - begin
-        # Multipliers grow without bound where active gradients become dependent; the
-        # price bounds elastic ones.
-        if step is None or np.abs(step.y).max(initial=0.0) > MAX_MULTIPLIER:
+        problem, step = self._problem, self._step(residual)
+        if step is None:
             return self._leave_stall(residual)
         accepted = self._search.find(problem, step, residual)
         if accepted is None and problem.elastic is None:
@@ -487,10 +483,19 @@ class InteriorRun(Run[IPMOptions]):
             return self._leave_stall(residual)
         return self._move(accepted)
 
+    def _step(self, residual: Vector, least_shift: float = 0.0) -> Step | None:
+        """Newton step; None if there is none, or its multipliers are too large."""
+        begin = self.report.elapsed()
+        step = self._problem.step(residual, least_shift)
+        self.report.seconds_qp += self.report.elapsed() - begin
+        # Multipliers grow without bound where active gradients become dependent; the
+        # price bounds elastic ones.
+        return None if step is None or np.abs(step.y).max(initial=0.0) > MAX_MULTIPLIER else step
+
     def _shifted(self, residual: Vector) -> AcceptedStep | None:
         """Step with a larger shift of the Hessian; None if all of them lead to short steps or none."""
         for shift in _SHIFTS:
-            step = self._problem.step(residual, shift)
+            step = self._step(residual, shift)
             if step is None:
                 break
             accepted = self._search.find(self._problem, step, residual)

@@ -236,10 +236,12 @@ class Description:
         A user's own postures, and an SRDF's, are refused there instead.
         """
         names = joint_names(model)
+        if self.kind != "MJCF" or not names:
+            return
         limits = position_limit(model, names, options.get("position_limit"))
         ranges = Ranges.of(names, *limits, options["tendons"])
         angles = JointAngles(moving_joints(model))
-        for name, q in reference_configurations(model).items() if self.kind == "MJCF" else ():
+        for name, q in reference_configurations(model).items():
             worst, excess = ranges.excess(angles.of(q)[None])
             if excess > POSITION_SLACK and name not in (options.get("postures") or {}):
                 del model.referenceConfigurations[name]

@@ -33,6 +33,7 @@ from impactopt import (
     HertzDamped,
     HuntCrossley,
     ImpactProblem,
+    Impulse,
     InputError,
     KelvinVoigt,
     Perturbation,
@@ -434,7 +435,9 @@ def test_a_soft_grip_is_a_spring_in_the_scene_and_the_tables(tmp_path: Path) -> 
 )
 def test_every_law_and_target_plays(planned: Planned, law: Any, target: Any, tmp_path: Path) -> None:
     """The arm's motion against other things than it was planned for."""
-    problem = dataclasses.replace(planned.problem, law=law, target=target, terms=BODILESS)
+    problem = dataclasses.replace(
+        planned.problem, law=law, target=target, terms=BODILESS, objectives=(Impulse(),)
+    )
     export_planned(dataclasses.replace(planned, problem=problem), "mujoco", tmp_path / "scene")
     fine = simulate_mujoco(
         problem.robot,

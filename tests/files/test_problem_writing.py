@@ -153,6 +153,15 @@ OBJECTIVES = st.lists(
     min_size=1,
     unique_by=type,
 ).map(tuple)
+
+
+def _undefined_energy(changes: dict[str, Any]) -> bool:
+    """True of the energy of a damped board, which is refused."""
+    target = changes.get("target")
+    damped = isinstance(target, impactopt.Board) and target.damping > 0
+    return damped and any(type(one) is objectives.TargetEnergy for one in changes.get("objectives", ()))
+
+
 LETTERS = st.characters(exclude_categories=["Cc", "Cs"], include_characters="\n\t")
 WORDS = st.text("ab \"'\\\n=#[", min_size=1).filter(lambda text: bool(text.strip()))
 SCENARIOS = st.lists(
@@ -196,7 +205,7 @@ CHANGES = st.fixed_dictionaries(
         "return_price": SMALL,
         "name": st.text(LETTERS, max_size=8),
     },
-)
+).filter(lambda found: not _undefined_energy(found))
 
 
 def goes_together(changes: dict[str, Any]) -> bool:

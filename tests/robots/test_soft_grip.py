@@ -169,7 +169,7 @@ def test_an_sdc_refuses_one_that_moves() -> None:
     """Its servos all coast: the impulse would be a tenth too large."""
     robot, q, v, torque, scene = _moving()
     model = SDC(**scene)
-    with pytest.raises(InputError, match=r"hammer_grip: SDC has no spring.*take FullDynamics"):
+    with pytest.raises(InputError, match=r"hammer_grip: in SDC the rest angle.*take FullDynamics"):
         model.collide(q, v, torque)
     with pytest.raises(InputError, match="hammer_grip"):
         model.batch(q[None], v[None], torque)

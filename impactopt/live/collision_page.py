@@ -57,8 +57,8 @@ class CollisionPage(LivePage):
 
     Raises
     ------
-    InputError : viser is missing; a problem with two strikers, a supporting hand or friction; host or port
-        are not available.
+    InputError : viser is missing; a problem with two strikers, a supporting hand, friction or a soft grip;
+        host or port are not available.
     """
 
     def __init__(self, problem: ImpactProblem, *, host: str = LOCAL, port: int = 0) -> None:

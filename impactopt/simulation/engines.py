@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_trapezoid
 
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, check_array, check_choice, check_kind, check_number, check_whole
@@ -178,25 +177,11 @@ def _step_error(
             compared = run(*given, **{**options, "step": other, "until": last + longest})
         except InputError:
             continue  # twice the step may be too long for the servo
-        impulses = [_impulse_until(s, last) for s in (simulation, compared)]
+        impulses = [s.impulse_until(last) for s in (simulation, compared)]
         largest = max(impulses)
         return abs(impulses[0] - impulses[1]) / largest if largest > 0 else np.nan
     # all steps tried diverge
     return np.inf
-
-
-def _impulse_until(simulation: Simulation, last: float) -> float:
-    """Impulse [N s] up to a time [s], at which a touch may last."""
-    time, force = simulation.contact_time, simulation.contact_force
-    impulse = cumulative_trapezoid(force, time, initial=0.0) if len(time) else force
-    total = 0.0
-    for start, end, whole in simulation.touches:
-        if end <= last:
-            total += whole
-        elif start < last:
-            before, now, after = np.interp([start, last, end], time, impulse)
-            total += whole * (now - before) / (after - before) if after > before else 0.0
-    return total
 
 
 def check_steps(simulation: Simulation, step: float | None) -> None:

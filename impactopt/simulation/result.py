@@ -248,6 +248,18 @@ class Simulation:
         """Centre of pressure (k, soles, 2) [m] of each sole, world; nan where it does not press."""
         return centre_of_pressure(self.sole_ground)
 
+    def impulse_until(self, last: float) -> float:
+        """Impulse [N s] up to a time [s], at which a touch may last."""
+        total = 0.0
+        for start, end, whole in self.touches:
+            if end <= last:
+                total += whole
+            elif start < last:
+                impulse = cumulative_trapezoid(self.contact_force, self.contact_time, initial=0.0)
+                before, now, after = np.interp([start, last, end], self.contact_time, impulse)
+                total += whole * (now - before) / (after - before) if after > before else 0.0
+        return total
+
     def aside(self) -> Array:
         """Displacement (k, 3) [m] of the target across its normal; zero if friction does not move it."""
         return self.target_aside if len(self.target_aside) else np.zeros((len(self.time), 3))

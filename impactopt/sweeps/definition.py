@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import combinations, cycle, islice
 from pathlib import Path
 from types import MappingProxyType
@@ -225,7 +226,7 @@ class Sweep:
         """Name for reports."""
         return self.settings.name or self.path.stem
 
-    @property
+    @cached_property
     def files(self) -> Mapping[str, str]:
         """Hashes of the robots' files and the saved results that cases read, by key and path."""
         data = {"robot": self.problem.data.get("robot", {}), "at_contact": self.at_contact}

@@ -469,10 +469,8 @@ class Limits:
         self.y_lower = np.concatenate([y0[: c.base] - box, lower[c.independent]])
         self.y_upper = np.concatenate([y0[: c.base] + box, upper[c.independent]])
         if c.drifts:
-            self.y_lower[4], self.y_upper[4] = (
-                max(self.y_lower[4], -MAX_PITCH),
-                min(self.y_upper[4], MAX_PITCH),
-            )
+            for bounds in (self.y_lower, self.y_upper):
+                bounds[4] = np.clip(bounds[4], -MAX_PITCH, MAX_PITCH)
         self.legs_lower, self.legs_upper = lower[c.dependent], upper[c.dependent]
         self.rate_limit = self.velocity.most(r)
         self.units = np.array([self.weight, LEVER])

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.integrate import trapezoid
 
 from impactopt import __version__
 from impactopt.contact.fields import abouts
@@ -297,9 +296,8 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
         )
     touches = np.array(replayed.touches)
     impact_end = touches[0, 0] + reference.contact_end - reference.contact_start + MAX_GAP
-    time, force = replayed.contact_time, replayed.contact_force
-    pressing = float(trapezoid(np.where(time > impact_end, force, 0.0), time))
-    impulse = replayed.impulse - pressing
+    impulse, whole = (replayed.impulse_until(t) for t in (impact_end, np.inf))
+    pressing = whole - impulse
     if pressing > impulse:
         raise InputError(
             f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "

@@ -6,33 +6,29 @@ import contextlib
 import ctypes
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
 from impactopt.errors import InputError, check_array
 from impactopt.solvers.program import (
     PATTERN_CHANGED,
-    BestIterate,
     Callback,
-    IterationRecord,
     Matrix,
     NonlinearProgram,
+    Point,
     SolverResult,
     Status,
     TimedProgram,
     Vector,
     check_program,
-    explain,
     is_stationary_violation,
-    max_violation,
-    stationarity,
 )
+from impactopt.solvers.run import Report
 
 
 class Pattern:
@@ -75,113 +71,69 @@ def _canonical(matrix: Matrix) -> Matrix:
 
 
 class Functions:
-    """Timed functions of a program, each evaluated once a point; the best point, and requests to stop."""
+    """Functions of a program, evaluated once a point, and requests to stop."""
 
     jacobian_pattern: Pattern
     hessian_pattern: Pattern
 
-    def __init__(self, program: NonlinearProgram, tolerance: float, deadline: float):
-        self.program, self.tolerance, self.deadline = program, tolerance, deadline
-        self.best = BestIterate(program, tolerance)
+    def __init__(self, program: NonlinearProgram, report: Report, deadline: float):
+        self.program, self.report, self.deadline = TimedProgram(program), report, deadline
         self.error: BaseException | None = None
         self.out_of_time = False
-        self.seconds = 0.0
-        self._x: Vector = np.full(program.n, np.nan)
-        self._known: dict[str, Any] = {}
+        self._point: Point | None = None
 
-    def start(self, x0: Vector) -> None:
-        """Consider the initial guess, so that there always is an iterate to return."""
-        x0 = np.clip(x0, self.program.x_lower, self.program.x_upper)
-        point = TimedProgram(self.program).point(x0)
-        self.best.consider(x0, point.objective, point.g)
-        # Not finite there: still the only point to return.
-        if self.best.x is None:
-            self.best.x = x0
-
-    def release(self) -> None:
-        """Discard the values at the last point."""
-        self._known = {}
+    def at(self, x: Vector) -> Point:
+        """The point x, which `Report.best` considers."""
+        # CasADi asks for f, g and their derivatives at one point in separate calls.
+        if self._point is None or not np.array_equal(x, self._point.x):
+            self._point = self.program.point(x.copy())
+            self.report.best.consider(self._point.x, self._point.objective, self._point.g)
+        return self._point
 
     def objective(self, x: Vector) -> Any:
-        value = self._at(x, "objective", self.program.objective)
-        self._consider()
-        return value
+        return self.at(x).objective
 
     def constraints(self, x: Vector) -> Any:
-        value = self._at(x, "constraints", self.program.constraints)
-        self._consider()
-        return value
+        return self.at(x).g
 
     def gradient(self, x: Vector) -> Any:
-        return self._at(x, "gradient", self.program.gradient)
+        return self.at(x).gradient
 
     def jacobian(self, x: Vector) -> Any:
-        return self.jacobian_pattern.values(self._at(x, "jacobian", self.program.jacobian))
+        return self.jacobian_pattern.values(self.at(x).jacobian)
 
     def hessian(self, x: Vector, _p: None, sigma: Vector, multipliers: Vector) -> Any:
         # Copies, as x and the multipliers are views of CasADi's buffers.
-        matrix = self._timed(lambda: self.program.hessian(x.copy(), float(sigma[0]), multipliers.copy()))
-        return self.hessian_pattern.values(matrix)
-
-    def kkt(self, x: Vector, multipliers: Vector, bound_multipliers: Vector) -> float:
-        """Scaled stationarity if the derivatives at x are known, else nan."""
-        known = self._known if np.array_equal(x, self._x) else {}
-        if "gradient" not in known or ("jacobian" not in known and self.program.m):
-            return np.nan
-        jacobian = known.get("jacobian", sp.csc_array((0, self.program.n)))
-        return stationarity(known["gradient"], jacobian, multipliers, bound_multipliers)
+        return self.hessian_pattern.values(
+            self.program.hessian(x.copy(), float(sigma[0]), multipliers.copy())
+        )
 
     def stopped(self) -> bool:
         self.out_of_time = self.out_of_time or time.perf_counter() > self.deadline
         return self.out_of_time or self.error is not None
 
-    def _at(self, x: Vector, name: str, function: Callable[[Vector], Any]) -> Any:
-        # CasADi asks for f, g and their derivatives at one point in separate calls.
-        if not np.array_equal(x, self._x):
-            self._x, self._known = x.copy(), {}
-        if name not in self._known:
-            self._known[name] = self._timed(lambda: function(self._x))
-        return self._known[name]
-
-    def _timed(self, evaluate: Callable[[], Any]) -> Any:
-        begin = time.perf_counter()
-        try:
-            return evaluate()
-        finally:
-            self.seconds += time.perf_counter() - begin
-
-    def _consider(self) -> None:
-        if "objective" in self._known and "constraints" in self._known:
-            self.best.consider(self._x, float(self._known["objective"]), self._known["constraints"])
-
 
 class IterationCallback:
-    """IPOPT's iteration callback: records the history and calls the progress callback."""
+    """IPOPT's iteration callback: the report of an iteration, its point and multipliers."""
 
-    def __init__(self, functions: Functions, callback: Callback | None, start: float):
-        self._functions, self._callback, self._start = functions, callback, start
-        program = functions.program
-        self.history: list[IterationRecord] = []
-        self.x = np.full(program.n, np.nan)
-        self.multipliers, self.bound_multipliers = np.zeros(program.m), np.zeros(program.n)
+    def __init__(self, functions: Functions, point: Point):
+        """point : initial guess."""
+        self._functions, self.point = functions, point
+        self.multipliers, self.bound_multipliers = np.zeros(len(point.g)), np.zeros(len(point.x))
 
-    def __call__(self, x: Vector, f: Vector, g: Vector, lam_x: Vector, lam_g: Vector, _lam_p: None) -> float:
+    def __call__(self, x: Vector, _f: Vector, _g: Vector, lam_x: Vector, lam_g: Vector, _p: Vector) -> float:
         functions = self._functions
-        step = float(np.max(np.abs(x - self.x), initial=0.0)) if self.history else 0.0
-        self.x, self.multipliers, self.bound_multipliers = x.copy(), lam_g.copy(), lam_x.copy()
-        record = IterationRecord(
-            iteration=len(self.history),
-            objective=float(f[0]),
-            max_violation=max_violation(functions.program, x, g),
-            kkt=functions.kkt(x, lam_g, lam_x),
-            step=step,
-            seconds=time.perf_counter() - self._start,
-        )
-        self.history.append(record)
-        if self._callback is not None and self._callback(record) is True:
+        # IPOPT needs the derivatives at this point next.
+        self.point = functions.at(x)
+        self.multipliers, self.bound_multipliers = lam_g.copy(), lam_x.copy()
+        if functions.report.iteration(self.point, self.kkt(), ""):
             # Like Ctrl-C: a status, no exception of `solve_ipopt`.
             functions.error = KeyboardInterrupt()
         return 1.0 if functions.stopped() else 0.0
+
+    def kkt(self) -> float:
+        """Scaled stationarity of the last iterate; nan if its derivatives are not finite."""
+        return self.point.kkt(self.multipliers, self.bound_multipliers)
 
 
 class BufferFunction(ca.Callback):
@@ -310,13 +262,11 @@ def solve_ipopt(
         # IPOPT takes positive limits only.
         settings["max_wall_time"] = max(float(time_limit), 1e-3)
     tolerance = float(check_array("constr_viol_tol", settings["constr_viol_tol"], ()))
-    start = time.perf_counter()
+    report = Report(program, tolerance, callback)
     # Besides IPOPT's own limit, which it tests between iterations: a single evaluation may take long.
-    functions = Functions(
-        program, tolerance, deadline=start + time_limit if time_limit is not None else np.inf
-    )
-    functions.start(x0)
-    progress = IterationCallback(functions, callback, start)
+    deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
+    functions = Functions(program, report, deadline)
+    progress = IterationCallback(functions, functions.at(np.clip(x0, program.x_lower, program.x_upper)))
     solver, _alive = _build(functions, progress, x0, settings)
     initial = {
         "x0": x0,
@@ -332,57 +282,32 @@ def solve_ipopt(
         answer, outcome = None, "User_Requested_Stop"
     if functions.error is not None and not isinstance(functions.error, KeyboardInterrupt):
         raise functions.error
-    return _result(functions, progress, answer, outcome, start)
-
-
-def _result(
-    functions: Functions,
-    progress: IterationCallback,
-    answer: Mapping[str, Any] | None,
-    outcome: str,
-    start: float,
-) -> SolverResult:
-    program, best = functions.program, functions.best
-    status = _STATUS.get(outcome, Status.FAILED)
     # We end it by a requested stop or by nan, so its own status does not give the cause.
     if functions.out_of_time:
         status = Status.TIME_LIMIT
     elif functions.error is not None:
         status = Status.INTERRUPTED
-    x, y, z = progress.x, progress.multipliers, progress.bound_multipliers
+    else:
+        status = _STATUS.get(outcome, Status.FAILED)
+    point, y, z = progress.point, progress.multipliers, progress.bound_multipliers
     if answer is not None and functions.error is None and not functions.out_of_time:
         x, y, z = (np.array(answer[key]).ravel() for key in ("x", "lam_g", "lam_x"))
-    # What the result has is evaluated anew below, at x.
-    functions.release()
-    if not status.usable and best.x is not None:
-        x = best.x
-    point = TimedProgram(program).point(x)
-    if (
-        status is Status.FAILED
-        and point.max_violation > functions.tolerance
+        point = functions.program.point(x)
+    if status is Status.FAILED and _is_infeasible(functions, tolerance):
+        status = Status.INFEASIBLE
+    stuck = f" IPOPT: {outcome.replace('_', ' ')}."
+    return report.result(status, functions.program, point, y, z, stuck=stuck)
+
+
+def _is_infeasible(functions: Functions, tolerance: float) -> bool:
+    """True if the best iterate's violation is stationary: IPOPT's restoration phase often fails there."""
+    if (x := functions.report.best.x) is None:
+        return False
+    point, program = functions.program.point(x), functions.program
+    return (
+        point.max_violation > tolerance
         and point.differentiable
         and is_stationary_violation(program, x, point.g, point.jacobian)
-    ):
-        status = Status.INFEASIBLE  # IPOPT's restoration phase often fails at such points
-    message = explain(program, status, x, point.g, tolerance=functions.tolerance)
-    if status is Status.FAILED:
-        message += f" IPOPT: {outcome.replace('_', ' ')}."
-        if not point.finite:
-            message += " The program's functions are not finite there."
-    return SolverResult(
-        x=x,
-        multipliers=y,
-        bound_multipliers=z,
-        objective=point.objective,
-        status=status,
-        iterations=max(len(progress.history) - 1, 0),
-        seconds=time.perf_counter() - start,
-        seconds_functions=functions.seconds,
-        seconds_qp=0.0,
-        max_violation=point.max_violation,
-        kkt=stationarity(point.gradient, point.jacobian, y, z) if point.differentiable else np.nan,
-        message=message,
-        history=tuple(progress.history),
     )
 
 

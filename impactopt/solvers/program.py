@@ -461,6 +461,10 @@ class Point:
         """Largest violation of a constraint or a bound."""
         return max_violation(self.program, self.x, self.g)
 
+    def kkt(self, y: Vector, z: Vector) -> float:
+        """Scaled `stationarity` with multipliers y (m,) and z (n,); nan if derivatives are not finite."""
+        return stationarity(self.gradient, self.jacobian, y, z) if self.differentiable else np.nan
+
 
 class TimedProgram:
     """A program whose function evaluations are timed, with weights of its constraints.

@@ -28,7 +28,6 @@ from impactopt.solvers.program import (
     Vector,
     check_program,
     explain,
-    stationarity,
 )
 
 
@@ -78,16 +77,26 @@ class Report:
         return self._callback is not None and self._callback(record) is True
 
     def result(
-        self, status: Status, program: TimedProgram, point: Point, y: Vector, z: Vector
+        self,
+        status: Status,
+        program: TimedProgram,
+        point: Point,
+        y: Vector,
+        z: Vector,
+        *,
+        stuck: str = " No step makes progress: wrong derivatives, bad scaling, or a QP solver that fails.",
     ) -> SolverResult:
-        """Result with a status: at the point if it is a solution, else at the best iterate."""
+        """Result with a status: at the point if it is a solution, else at the best iterate.
+
+        stuck : reason of a failure at a point that has derivatives.
+        """
         # y and z stay those of the last iterate, as none are stored with the best:
         # kkt is then of this mixture.
         if not status.usable and self.best.x is not None:
             point = program.point(self.best.x)
         message = explain(self._program, status, point.x, point.g, tolerance=self._tolerance)
         if status is Status.FAILED:
-            message += _failure_reason(point)
+            message += _failure_reason(point) or stuck
         return SolverResult(
             x=point.x,
             multipliers=y,
@@ -100,7 +109,7 @@ class Report:
             seconds_functions=program.seconds,
             seconds_qp=self.seconds_qp,
             max_violation=point.max_violation,
-            kkt=stationarity(point.gradient, point.jacobian, y, z) if point.differentiable else np.nan,
+            kkt=point.kkt(y, z),
             message=message,
             history=tuple(self._history),
         )
@@ -111,7 +120,7 @@ def _failure_reason(point: Point) -> str:
         return " The program's functions are not finite there; give another initial guess."
     if not point.differentiable:
         return " The program's derivatives are not finite there; give another initial guess."
-    return " No step makes progress: wrong derivatives, bad scaling, or a QP solver that fails."
+    return ""
 
 
 _Options = TypeVar("_Options", bound=SolverOptions)

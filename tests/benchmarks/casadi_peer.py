@@ -5,13 +5,12 @@ A peer to measure against; plans are not solved by it.
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from benchmarks.peer_result import peer_result
+from benchmarks.peer_result import peer_functions, peer_result
 from impactopt.solvers.ipopt import BufferFunction, Functions, IterationCallback, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
 
@@ -39,10 +38,8 @@ def solve_sqpmethod(
 
     qp : CasADi's name of the QP solver.  time_limit [s] : looked at once an iteration and in the functions.
     """
-    began = time.perf_counter()
-    functions = Functions(program, 1e-6, began + time_limit)
-    functions.start(x0)
-    progress = IterationCallback(functions, None, began)
+    functions = peer_functions(program, x0, tolerance=1e-6, time_limit=time_limit)
+    progress = IterationCallback(functions, functions.at(x0))
     solver, _alive = _build(functions, progress, x0, qp)
     bounds = {
         "lbx": program.x_lower, "ubx": program.x_upper, "lbg": program.g_lower, "ubg": program.g_upper
@@ -56,8 +53,7 @@ def solve_sqpmethod(
         x, y, z = (np.array(answer[key]).ravel() for key in ("x", "lam_g", "lam_x"))
     except RuntimeError as error:  # its QP solver gave up
         outcome = str(error).strip().splitlines()[-1]
-    iterations = max(len(progress.history) - 1, 0)
-    how: dict[str, Any] = {"message": outcome, "since": began, "iterations": iterations}
+    how: dict[str, Any] = {"message": outcome, "iterations": max(functions.report.iterations - 1, 0)}
     return peer_result(functions, _STATUS.get(outcome, Status.FAILED), x, y, z, seconds_qp=seconds_qp, **how)
 
 

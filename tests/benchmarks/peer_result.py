@@ -16,6 +16,19 @@ from impactopt.solvers.program import (
     max_violation,
     stationarity,
 )
+from impactopt.solvers.run import Report
+
+
+def peer_functions(
+    program: NonlinearProgram, x0: Vector, *, tolerance: float, time_limit: float
+) -> Functions:
+    """Functions that a peer evaluates for at most time_limit [s]; the initial guess (n,) is their best point.
+
+    tolerance : of violations.
+    """
+    functions = Functions(program, Report(program, tolerance, None), time.perf_counter() + time_limit)
+    functions.at(np.clip(x0, program.x_lower, program.x_upper))
+    return functions
 
 
 def peer_result(
@@ -26,19 +39,19 @@ def peer_result(
     bound_multipliers: Vector,
     *,
     message: str,
-    since: float,
     iterations: int,
     seconds_qp: float = np.nan,
 ) -> SolverResult:
     """Result at the peer's last point if that is usable, else at the best point; evaluated here.
 
-    since : clock at the beginning.  An exception of the functions is raised again here.
+    An exception of the functions is raised again here.
     """
     if functions.error is not None:
         raise functions.error
     status = Status.TIME_LIMIT if functions.out_of_time else status
-    if not status.usable and functions.best.x is not None:
-        x = functions.best.x
+    if not status.usable and functions.report.best.x is not None:
+        x = functions.report.best.x
+    seconds = functions.program.seconds
     return evaluated_result(
         functions.program,
         x,
@@ -46,8 +59,8 @@ def peer_result(
         bound_multipliers,
         status=status,
         iterations=iterations,
-        seconds=time.perf_counter() - since,
-        seconds_functions=functions.seconds,
+        seconds=functions.report.elapsed(),
+        seconds_functions=seconds,
         seconds_qp=seconds_qp,
         message="out of time" if functions.out_of_time else message,
     )

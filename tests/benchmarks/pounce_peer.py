@@ -5,13 +5,12 @@ A peer to measure against, with the tolerances and limits that IPOPT has here; p
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from benchmarks.peer_result import peer_result
+from benchmarks.peer_result import peer_functions, peer_result
 from impactopt.errors import missing_package
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS, Functions, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
@@ -41,9 +40,8 @@ def solve_pounce(program: NonlinearProgram, x0: Vector, time_limit: float) -> So
         import pounce
     except ImportError as error:
         raise missing_package("POUNCE", "pounce-solver", "peers") from error
-    began = time.perf_counter()
-    functions = Functions(program, IPOPT_DEFAULTS["constr_viol_tol"], began + time_limit)
-    functions.start(x0)
+    tolerance = IPOPT_DEFAULTS["constr_viol_tol"]
+    functions = peer_functions(program, x0, tolerance=tolerance, time_limit=time_limit)
     bounds = {"lb": program.x_lower, "ub": program.x_upper, "cl": program.g_lower, "cu": program.g_upper}
     problem = pounce.Problem(program.n, program.m, _Callbacks(functions, x0), **bounds)
     for name, value in _OF_IPOPT.items():
@@ -56,7 +54,6 @@ def solve_pounce(program: NonlinearProgram, x0: Vector, time_limit: float) -> So
         np.asarray(found["mult_g"]),
         np.asarray(found["mult_x_U"]) - np.asarray(found["mult_x_L"]),
         message=str(found["status_msg"]),
-        since=began,
         iterations=int(found["iter_count"]),
     )
 

@@ -5,13 +5,12 @@ A peer to measure against, with the tolerances and limits that IPOPT has here; p
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from benchmarks.peer_result import peer_result
+from benchmarks.peer_result import peer_functions, peer_result
 from impactopt.errors import missing_package
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS, Functions, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
@@ -56,9 +55,8 @@ def solve_uno(program: NonlinearProgram, x0: Vector, time_limit: float, *, prese
         import unopy
     except ImportError as error:
         raise missing_package("Uno", "unopy", "peers") from error
-    began = time.perf_counter()
-    functions = Functions(program, _OPTIONS["primal_tolerance"], began + time_limit)
-    functions.start(x0)
+    tolerance = _OPTIONS["primal_tolerance"]
+    functions = peer_functions(program, x0, tolerance=tolerance, time_limit=time_limit)
     solver = unopy.UnoSolver()
     solver.set_preset(preset)
     for name, value in _OPTIONS.items():
@@ -73,7 +71,6 @@ def solve_uno(program: NonlinearProgram, x0: Vector, time_limit: float, *, prese
         np.array(found.constraint_dual_solution),
         np.array(found.lower_bound_dual_solution) + np.array(found.upper_bound_dual_solution),
         message=f"{ended}, {point}",
-        since=began,
         iterations=int(found.number_iterations),
     )
 
@@ -122,7 +119,10 @@ def _guarded(functions: Functions, function: Callable[..., Any]) -> Callable[...
         if functions.stopped():
             raise ArithmeticError("stopped")
         try:
-            return function(*arguments)
+            value = function(*arguments)
+            if not np.isfinite(value).all():
+                raise ArithmeticError("not finite")
+            return value
         except (ArithmeticError, np.linalg.LinAlgError):
             raise
         except BaseException as error:

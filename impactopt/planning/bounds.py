@@ -122,8 +122,10 @@ def _durations(t: Transcription) -> Iterator[Bound]:
     for name, group in t.layout.groups.items():
         if name.endswith(" duration"):
             # Names are those of the transcription's groups; an abort motion has the follow-through's bounds.
+            # Those of a scenario begin with its name and a colon, and are the durations of its contact.
             kind = name.split()[0].removesuffix("-abort").replace("abort", "follow")
-            kind = kind if kind in ("swing", "follow") or kind.startswith("stance") else "contact"
+            of_motion = kind in ("swing", "follow") or kind.startswith("stance")
+            kind = kind if of_motion and ": " not in name else "contact"
             found.setdefault(kind, []).append(group.offset)
     # [s] units of the duration variables, as of the transcription
     scale = {kind: 0.01 if kind == "contact" else 0.1 for kind in found}

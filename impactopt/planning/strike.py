@@ -13,7 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
 from impactopt.planning.budget import Budget, touching
-from impactopt.planning.clearance_constraints import Margins, deepest_penetration, solve_with_clearance
+from impactopt.planning.clearance_constraints import (
+    Margins,
+    deepest_penetration,
+    same_bodies,
+    solve_with_clearance,
+)
 from impactopt.planning.diagnosis import with_reason
 from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
 from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, lazy_terms_of, with_lazy_constraints
@@ -146,7 +151,8 @@ def _optimized(
     if isinstance(start, StrikeSolution):
         # Only its variables: clearance constraints enter by themselves.
         old = partial(_program_on, start.problem, *mesh)
-        start = carried_start(t, old, start, start.clearance_constraints).x
+        apart = start.clearance_constraints if same_bodies(problem, start.problem) else {}
+        start = carried_start(t, old, start, apart).x
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     solve = partial(_clean_strike, budget, Margins(problem) if problem.keeps_apart else None)
 

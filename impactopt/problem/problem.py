@@ -279,6 +279,8 @@ class ImpactProblem:
 
     def _check_start(self) -> None:
         posture = self.start_posture
+        if not isinstance(self.start, str):  # a copy, which does not follow the caller's array
+            object.__setattr__(self, "start", posture.copy())
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, [sole.name for sole in self.soles])
         first = self.stance_coordinates[0]

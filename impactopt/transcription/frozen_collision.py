@@ -89,8 +89,8 @@ class InstantImpact:
 
     @property
     def target_state(self) -> Affine:
-        """State of the target after the impact."""
-        return self.impulse_group[0] * (1 / self.mass)
+        """State (n_states,) of the target after the impact: a mass's speed that it gained; of a wall none."""
+        return self.impulse_group[0] * (1 / self.mass) if self.target.n_states else Affine.zeros(0)
 
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of the block ``impact``."""

@@ -912,8 +912,7 @@ class PlannedStrike:
         The capture point is that after contact. An impact without duration has no torque and no ZMP.
         """
         limit, hit = self.problem.robot.torque_limit, self.collision
-        lasts = len(hit.ground) > 0 or not self.problem.robot.floating
-        torques = {"contact": self.torque, "collision": hit.torque if lasts else hit.torque[:0]}
+        torques = {"contact": self.torque, "collision": hit.torque if self.problem.lasts else hit.torque[:0]}
         out: dict[str, Any] = {
             "torque_ratio": {name: float(np.abs(t / limit).max()) for name, t in torques.items() if len(t)}
         }

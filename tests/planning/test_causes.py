@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from support.causes import searched
+from support.small_plans import BODILESS, arm_problem, transcribed
 
 from impactopt import (
     Effort,
@@ -20,12 +21,14 @@ from impactopt import (
     NotSolvedWarning,
     Obstacle,
     Phase,
+    Scenario,
     Solution,
     Status,
     TorqueLimit,
     load_problem,
     solve,
 )
+from impactopt.planning.bounds import bounds_of
 from impactopt.planning.budget import stopping
 from impactopt.planning.diagnosis import with_reason
 from impactopt.problem.feasibility import too_weak
@@ -67,6 +70,18 @@ def test_the_bound_that_is_named_is_the_one_that_has_to_move(arm: ImpactProblem,
     )
     assert cause.problem is not None
     assert solve(cause.problem).status.usable
+
+
+def test_a_scenario_may_be_called_as_a_phase_begins() -> None:
+    """Its durations are those of a contact, whatever its name."""
+    told = []
+    for name in ("stance heavy", "follow up", "heavy"):
+        t = transcribed(
+            dataclasses.replace(arm_problem(), terms=BODILESS, scenarios=(Scenario(name=name, mass=2.0),))
+        )
+        x = np.full(t.layout.n, 100.0)  # all durations are too long
+        told.append([[cause.text for cause in b.causes(x)] for b in bounds_of(t) if b.is_time])
+    assert len(told[2]) == 3 and told[0] == told[1] == told[2]
 
 
 def test_no_cause_is_confirmed_by_a_motion_through_an_obstacle(arm: ImpactProblem) -> None:

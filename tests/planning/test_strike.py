@@ -27,6 +27,7 @@ from impactopt import (
     Impulse,
     Incidence,
     InputError,
+    Obstacle,
     PeakForce,
     Scenario,
     Solution,
@@ -301,6 +302,23 @@ def test_an_impact_without_duration_has_no_force(
     assert (summary["peak_force_N"], summary["contact_ms"]) == (None, 0.0)
     assert set(summary["torque_ratio"]) == set(summary["zmp_margin_m"]) == {"contact"}
     np.testing.assert_allclose(found.strike.posture_after, found.strike.posture)
+
+
+def test_nor_has_a_fixed_arm_a_torque_in_it(
+    arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = optimized(changed(arm_transcription, terms=BODILESS, collision="rigid"), monkeypatch)
+    assert set(found.strike.margins()["torque_ratio"]) == {"contact"}
+
+
+def test_a_strike_starts_another_without_its_obstacle(arm_transcription: Transcription) -> None:
+    """Whose clearance constraints name bodies that there are not."""
+    p = arm_transcription.problem
+    low, high = (tuple(p.point + np.array([0.12, -0.1, z])) for z in (-0.2, 0.2))
+    rod = Obstacle(name="rod", start=low, end=high, radius=0.02)
+    first = optimize_strike(dataclasses.replace(p, obstacles=(rod,), collision="sdc"))
+    assert first.clearance_constraints
+    assert optimize_strike(p, start=first).status is Status.SOLVED
 
 
 # ---- several starts

@@ -25,6 +25,7 @@ from impactopt import (
     PeakForce,
     Penetration,
     Plan,
+    RigidWall,
     Status,
     TargetEnergy,
 )
@@ -182,6 +183,8 @@ def test_the_energy_of_an_impact_without_duration(arm_transcription: Transcripti
     x, plan = solved(rigid, first_iterate(rigid))
     mass = rigid.problem.target.mass
     assert rigid.achieved(x)["target energy"] == pytest.approx(plan.impulse**2 / (2 * mass))
+    wall = changed(arm_transcription, target=RigidWall(), objectives=(TargetEnergy(),), collision="rigid")
+    assert wall.achieved(first_iterate(wall))["target energy"] == 0.0
 
 
 @pytest.mark.parametrize(

@@ -142,10 +142,12 @@ def test_a_knee_strikes_of_a_leg_that_does_not_stand(robot: Robot) -> None:
 
 
 def test_inputs_are_copied(robot: Robot) -> None:
-    point = np.array([0.5, -0.15, 1.1])
-    p = problem(robot, point=point)
-    point[:] = 9
+    point, start = np.array([0.5, -0.15, 1.1]), np.array(robot.posture("half_sitting"))
+    p = problem(robot, point=point, start=start)
+    point[:] = start[:] = 9
     assert p.point[0] == 0.5
+    np.testing.assert_array_equal(p.start, p.start_posture)
+    assert p.start_posture is not p.start and 9 not in p.start_posture
 
 
 @pytest.mark.parametrize(

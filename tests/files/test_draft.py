@@ -708,6 +708,27 @@ def test_a_rotor_without_its_gear_is_not_believed(tmp_path: Path) -> None:
     assert drives.said == ["armature of turn, 5e-05 kg m2: hard to believe, and guessed"]
 
 
+@pytest.mark.parametrize("stages", [1, 2], ids=["one stage", "a second one that follows"])
+def test_the_guessed_torque_holds_an_extended_telescope(tmp_path: Path, stages: int) -> None:
+    """With the promised factor over gravity, horizontal and at its full length, and no more than that."""
+    none = {"effort": 0.0, "velocity": 0.0}
+    parts = [urdfs.link("base", 10.0, (0.2, 0.2, 0.4), (0, 0, 0.2))]
+    parts += [urdfs.link("tube_0", 2.0, (0.3, 0.05, 0.05), (0.15, 0, 0))]
+    parts += [urdfs.joint("shoulder", "base", "tube_0", "0 1 0", (0, 0, 0.5), (-2, 2), **none)]
+    for k in range(stages):
+        parts += [urdfs.link(f"tube_{k + 1}", 1.0, (0.3, 0.05, 0.05), (0.15, 0, 0))]
+        slide = {"kind": "prismatic", **none}
+        parts += [
+            urdfs.joint(f"out_{k}", f"tube_{k}", f"tube_{k + 1}", "1 0 0", (0.3, 0, 0), (0, 3), **slide)
+        ]
+    law = 'joint="out_0" multiplier="0.5" offset="0.2"'
+    robot = _robot(tmp_path, urdfs.following(urdfs.robot("telescope", *parts), "out_1", law)).robot
+    assert robot.joint_names == ("shoulder", "out_0") and len(robot.couplings) == stages - 1
+    out = np.array([0.0, 3.0])
+    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), out)
+    assert robot.torque_limit[0] == pytest.approx(3 * abs(gravity[0]), rel=0.05)  # rounded to two digits
+
+
 def test_negative_limits_stand_for_none(tmp_path: Path) -> None:
     """As in SDF; Pinocchio refuses them."""
     robots = [_robot(tmp_path, urdfs.arm(effort=limit, velocity=limit)).robot for limit in (-1.0, 0.0)]

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.robots.build import effort_limit, is_floating, joint_indices, joint_names, velocity_limit
-from impactopt.robots.couplings import couplings_of
+from impactopt.robots.couplings import Coupling, axis_of, couplings_of
 from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 
 # by joint type: True for a revolute joint, False for a prismatic one
@@ -82,21 +82,34 @@ def guess_drives(
 
 def _largest_gravity(model: pin.Model) -> list[float]:
     """Upper bound of the gravity torque [N m], [N] of each joint: its subtree stretched out horizontally."""
-    first = 2 if is_floating(model) else 1
-    mass = np.zeros(model.njoints)
-    moment = np.zeros(model.njoints)
+    first, couplings = 2 if is_floating(model) else 1, couplings_of(model)
+    mass, moment, load = np.zeros((3, model.njoints))
     for j in range(model.njoints - 1, first - 1, -1):
         mass[j] += model.inertias[j].mass
         moment[j] += model.inertias[j].mass * float(np.linalg.norm(model.inertias[j].lever))
+        prismatic = axis_of(model, j).subspace[:3].any()
+        load[j] = mass[j] if prismatic else moment[j]
         parent, length = int(model.parents[j]), float(np.linalg.norm(model.jointPlacements[j].translation))
+        if prismatic:
+            length += _travel(model, j, couplings.get(str(model.names[j])))
         mass[parent] += mass[j]
         moment[parent] += moment[j] + mass[j] * length
-    for name, law in couplings_of(model).items():  # the leader's motor carries its followers, too
+    for name, law in couplings.items():  # the leader's motor carries its followers, too
         follower, leader = (model.getJointId(joint) for joint in (name, law.leader))
-        mass[leader] += abs(law.ratio) * mass[follower]
-        moment[leader] += abs(law.ratio) * moment[follower]
-    slides = [(j, "JointModelP" in model.joints[j].shortname()) for j in joint_indices(model)]
-    return [9.81 * float(mass[j] if slide else moment[j]) for j, slide in slides]
+        load[leader] += abs(law.ratio) * load[follower]
+    return [9.81 * float(load[j]) for j in joint_indices(model)]
+
+
+def _travel(model: pin.Model, joint: int, law: Coupling | None) -> float:
+    """Largest distance [m] of a prismatic joint from its zero; 0 without limits.
+
+    law : of a follower, whose limits are its leader's.
+    """
+    k = model.joints[joint].idx_q
+    ends = np.array([model.lowerPositionLimit[k], model.upperPositionLimit[k]])
+    if law is not None:
+        ends = law.ratio * ends + law.offset
+    return float(np.abs(ends).max()) if np.isfinite(ends).all() else 0.0
 
 
 def _rounded(number: float) -> float:

@@ -729,6 +729,11 @@ def test_the_guessed_torque_holds_an_extended_telescope(tmp_path: Path, stages: 
     assert robot.torque_limit[0] == pytest.approx(3 * abs(gravity[0]), rel=0.05)  # rounded to two digits
 
 
+def test_an_inner_joint_of_six_degrees_of_freedom_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"'turn'.*6 degrees of freedom.*split it"):
+        _robot(tmp_path, urdfs.arm().replace('name="turn" type="revolute"', 'name="turn" type="floating"'))
+
+
 def test_negative_limits_stand_for_none(tmp_path: Path) -> None:
     """As in SDF; Pinocchio refuses them."""
     robots = [_robot(tmp_path, urdfs.arm(effort=limit, velocity=limit)).robot for limit in (-1.0, 0.0)]

@@ -87,7 +87,8 @@ def _largest_gravity(model: pin.Model) -> list[float]:
     for j in range(model.njoints - 1, first - 1, -1):
         mass[j] += model.inertias[j].mass
         moment[j] += model.inertias[j].mass * float(np.linalg.norm(model.inertias[j].lever))
-        prismatic = axis_of(model, j).subspace[:3].any()
+        # a joint of more degrees of freedom is refused later, when the robot is made
+        prismatic = model.joints[j].nv <= 1 and axis_of(model, j).subspace[:3].any()
         load[j] = mass[j] if prismatic else moment[j]
         parent, length = int(model.parents[j]), float(np.linalg.norm(model.jointPlacements[j].translation))
         if prismatic:

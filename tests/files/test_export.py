@@ -20,8 +20,9 @@ import yaml
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from support.fake_solution import still_solution, strike_record
+from support.fake_solution import still_problem, still_solution, strike_record
 from support.small_plans import BODILESS, rod_hammer
+from support.small_robots import biped
 from typer.testing import CliRunner
 
 import impactopt
@@ -43,6 +44,7 @@ from impactopt import (
     Solution,
     SpringDamper,
     Status,
+    Tool,
     load_problem,
     solve,
 )
@@ -534,6 +536,22 @@ def test_mjlab_has_the_kinematics_of_mujoco(arm: Solution, tmp_path: Path) -> No
     order = [1, 0, 2]
     np.testing.assert_allclose(motion["joint_pos"][k], y[0][order], atol=1e-9)
     np.testing.assert_allclose(motion["joint_vel"][k], rate[0][order], atol=1e-6)
+
+
+def test_mjlab_has_only_the_joints_of_the_robots_file(tmp_path: Path) -> None:
+    """Policies read columns by position, and no file has the joints of soft grips and soles' hinges."""
+    own = biped(5)
+    grip = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5)
+    hammer: Any = {"mass": 0.5, "center": np.zeros(3), "inertia": np.full(3, 1e-3), "head": np.array([0.1, 0, 0])}
+    robot = own.with_tool(Tool(name="hammer", frame="fist", grip=grip, **hammer))
+    joints = [name for k, name in enumerate(robot.joint_names) if not robot.passive[k]]
+    assert len(joints) == robot.n - 3
+    solution = still_solution(problem=still_problem(robot=robot, terms=BODILESS))
+    solution.export("mjlab", tmp_path / "m")
+    motion = check_mjlab(solution, tmp_path / "m" / "motion.npz")
+    assert list(motion["joint_names"]) == joints
+    assert motion["joint_pos"].shape[1] == motion["joint_vel"].shape[1] == len(joints)
+    assert motion["body_pos_w"].shape[1] == len(motion["body_names"]) == len(joints) + 1
 
 
 # ---------------------------------------------------------------- a humanoid

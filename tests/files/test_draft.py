@@ -729,6 +729,13 @@ def test_the_guessed_torque_holds_an_extended_telescope(tmp_path: Path, stages: 
     assert robot.torque_limit[0] == pytest.approx(3 * abs(gravity[0]), rel=0.05)  # rounded to two digits
 
 
+@pytest.mark.parametrize("effort", [0.05, 60.0])
+def test_a_guessed_rotor_is_what_the_draft_says(tmp_path: Path, effort: float) -> None:
+    """1 g m2 for each N m, also of motors of some grams."""
+    drives = _robot(tmp_path, urdfs.arm(effort=effort)).drives
+    assert drives.armature == dict.fromkeys(("turn", "shoulder", "elbow", "wrist"), 1e-3 * effort)
+
+
 def test_an_inner_joint_of_six_degrees_of_freedom_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'turn'.*6 degrees of freedom.*split it"):
         _robot(tmp_path, urdfs.arm().replace('name="turn" type="revolute"', 'name="turn" type="floating"'))

@@ -13,7 +13,6 @@ from impactopt.robots.couplings import Coupling, axis_of, couplings_of
 from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 
 # by joint type: True for a revolute joint, False for a prismatic one
-MIN_ARMATURE = {True: 1e-3, False: 0.05}  # [kg m2], [kg]
 SPEED = {True: 3.0, False: 0.3}  # guessed velocity limit [rad/s], [m/s]
 RANGE = (-3.14, 3.14)  # [rad] guessed position limits
 MIN_TORQUE = {True: 2.0, False: 50.0}  # [N m], [N]
@@ -76,7 +75,7 @@ def guess_drives(
         if armature < LIGHTEST_ROTOR * limit:  # as of a rotor whose gear ratio is left out
             if armature:
                 out.said.append(f"armature of {joint}, {armature:.2g} kg m2: hard to believe, and guessed")
-            out.armature[joint] = _rounded(max(USUAL_ROTOR * limit, MIN_ARMATURE[revolute]))
+            out.armature[joint] = _rounded(USUAL_ROTOR * limit)
     return out
 
 

@@ -701,11 +701,30 @@ def test_a_rotor_without_its_gear_is_not_believed(tmp_path: Path) -> None:
     """Some files give the rotor's own inertia, without the square of the gear's ratio."""
     (tmp_path / "robot.urdf").write_text(urdfs.arm(effort=60.0))
     model = read_urdf(tmp_path / "robot.urdf", floating=False).model
-    model.armature = np.array([5e-5, 7e-5, 0.0, 0.1, 0.0, 0.0])
+    model.armature = np.array([5e-5, 7e-5, 0.0, 0.1, 1e-5, 0.0])
     drives = guess_drives(model, {})
     assert drives.armature.keys() == {"turn", "elbow", "slide_0", "slide_1"}
     assert drives.armature["turn"] == drives.armature["elbow"] > 0.01
-    assert drives.said == ["armature of turn, 5e-05 kg m2: hard to believe, and guessed"]
+    assert drives.said == [
+        "armature of turn, 5e-05 kg m2: hard to believe, and guessed",
+        "armature of slide_0, 1e-05 kg: hard to believe, and guessed",
+    ]
+
+
+def test_limits_that_are_hard_to_believe_are_told_in_the_joints_units(tmp_path: Path) -> None:
+    rail = urdfs.joint("rail", "a", "b", "1 0 0", (0, 0, 0), (0, 1), kind="prismatic", effort=2e4)
+    turn = urdfs.joint("turn", "base", "a", "0 0 1", (0, 0, 0.5), (-1, 1), effort=600.0)
+    links = [urdfs.link(name, 2.0, (0.3, 0.1, 0.1), (0.15, 0, 0)) for name in ("base", "a", "b")]
+    text = urdfs.robot("crane", *links, turn, rail).replace('velocity="6.0"', 'velocity="100"')
+    assert _robot(tmp_path, text).drives.said == [
+        "torque limit of turn, 600 N m: hard to believe",
+        "velocity limit of turn, 100 rad/s: hard to believe",
+        "torque limit of rail, 20000 N: hard to believe",
+        "velocity limit of rail, 100 m/s: hard to believe",
+    ]
+    robot = draft_robot(tmp_path / "robot.urdf").made(armature={"turn": 1.0, "rail": 1e-3})
+    (told,) = (text for text in doubts(robot) if text.startswith("armature of rail"))
+    assert "0.001 kg is hard to believe of a drive of 2e+04 N, too small; 0.02 kg is the least" in told
 
 
 @pytest.mark.parametrize("stages", [1, 2], ids=["one stage", "a second one that follows"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -103,7 +104,7 @@ def export(
                     "limit; give smaller limits, or plan with a smaller fraction in [terms.torque_limit]"
                 )
         if to in NEXT:
-            typer.echo(printable(NEXT[to].format(directory=directory)))
+            typer.echo(printable(NEXT[to].format(directory=shlex.quote(str(directory)))))
 
 
 def _limits(given: str) -> tuple[float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shlex
 import warnings
 from pathlib import Path
 from typing import Any
@@ -1092,11 +1093,16 @@ def test_robots_of_example_robot_data_go_by_name() -> None:
 
 def test_the_command_writes_a_file_once(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(urdfs.arm())
-    words = ["new", "--urdf", str(tmp_path / "arm.urdf"), "--out", str(tmp_path / "arm.toml")]
+    out = tmp_path / "my arm.toml"
+    words = ["new", "--urdf", str(tmp_path / "arm.urdf"), "--out", str(out)]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    assert "guessed" in done.output and "impactopt check" in done.output
-    assert read_toml((tmp_path / "arm.toml").read_text())["robot"]["urdf"] == "arm.urdf"
+    assert "guessed" in done.output
+    (commands,) = [line for line in done.output.splitlines() if line.startswith("next: ")]
+    first, then = commands.removeprefix("next: ").split("; then ")
+    assert shlex.split(first) == ["impactopt", "check", str(out)]
+    assert shlex.split(then) == ["impactopt", "solve", str(out)]
+    assert read_toml(out.read_text())["robot"]["urdf"] == "arm.urdf"
     again = CliRunner().invoke(app, words)
     assert again.exit_code == 2 and "already" in again.output
     assert CliRunner().invoke(app, ["new", "punch", "--urdf", "x"]).exit_code == 2

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -719,10 +720,10 @@ def test_the_command_writes_and_lists_files(
     assert told["to"] == "csv" and told["directory"] == str(tmp_path / "arm_csv")
     assert [Path(p).name for p in told["files"]] == ["meta.json", "motion.csv"]
     assert all(Path(p).is_file() for p in told["files"])
-    done = runner.invoke(
-        app, ["export", str(tmp_path / "arm"), "--to", "mujoco", "--out", str(tmp_path / "m")]
-    )
-    assert done.stdout.splitlines()[-2:] == [f"{tmp_path}/m/scene.xml", f"python {tmp_path}/m/play.py"]
+    out = tmp_path / "a scene"
+    done = runner.invoke(app, ["export", str(tmp_path / "arm"), "--to", "mujoco", "--out", str(out)])
+    *_, scene, command = done.stdout.splitlines()
+    assert scene == f"{out}/scene.xml" and shlex.split(command) == ["python", f"{out}/play.py"]
     monkeypatch.chdir(tmp_path / "arm")
     done = runner.invoke(app, ["export", ".", "--to", "mjlab", "--json"])
     assert json.loads(done.stdout)["directory"] == str(tmp_path / "arm_mjlab")

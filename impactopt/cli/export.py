@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -97,8 +98,13 @@ def export(
                 f"smoothed: {cost['impulse_Ns']:.3g} N s in our replay, {abs(change):.1f} % "
                 f"{'less' if change < 0 else 'more'} than the {cost['planned_impulse_Ns']:.3g} planned{meets}"
             )
+            if cost["feed_forward_ratio"] > 1:
+                typer.echo(
+                    f"caution: its feed-forward is up to {cost['feed_forward_ratio']:.3g} times a torque "
+                    "limit; give smaller limits, or plan with a smaller fraction in [terms.torque_limit]"
+                )
         if to in NEXT:
-            typer.echo(printable(NEXT[to].format(directory=directory)))
+            typer.echo(printable(NEXT[to].format(directory=shlex.quote(str(directory)))))
 
 
 def _limits(given: str) -> tuple[float, float]:

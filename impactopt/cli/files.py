@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -177,7 +178,8 @@ def _draft(
     for line in draft.said:
         typer.echo(printable(line), err=True)
     if out is not None:
-        typer.echo(f"next: impactopt check {out}; then impactopt solve {out}", err=True)
+        file = shlex.quote(str(out))
+        typer.echo(printable(f"next: impactopt check {file}; then impactopt solve {file}"), err=True)
 
 
 def _give(text: str, out: Path | None, as_json: bool = False) -> None:

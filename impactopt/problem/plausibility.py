@@ -73,10 +73,11 @@ def _armatures(robot: Robot) -> Iterator[str]:
         if names:
             k = robot.joint_index(names[0])
             armature, torque = robot.armature[k], robot.torque_limit[k]
+            inertia, effort = ("kg", "N") if robot.prismatic[k] else ("kg m2", "N m")
             yield (
-                f"armature of {_counted(names)}: {armature:.2g} kg m2 is hard to believe of a drive of "
-                f"{torque:.3g} N m, too {what}; {bound * torque:.2g} kg m2 is the {end} (rotor inertia "
-                "x gear ratio^2)"
+                f"armature of {_counted(names)}: {armature:.2g} {inertia} is hard to believe of a drive of "
+                f"{torque:.3g} {effort}, too {what}; {bound * torque:.2g} {inertia} is the {end} (rotor "
+                "inertia x gear ratio^2)"
             )
 
 

@@ -58,6 +58,11 @@ def joint_names(model: pin.Model) -> tuple[str, ...]:
     return tuple(str(model.names[j]) for j in joint_indices(model))
 
 
+def prismatic(model: pin.Model) -> NDArray[np.bool_]:
+    """Mask of the prismatic joints among those of `joint_indices`."""
+    return np.array(["JointModelP" in joint.shortname() for joint in moving_joints(model)], dtype=bool)
+
+
 def joint_index(names: Sequence[str], name: str, what: str) -> int:
     check_choice(f"{what}: no joint", name, names)
     return list(names).index(name)

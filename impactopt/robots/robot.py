@@ -312,6 +312,11 @@ class Robot:
         """(n,) Pinocchio's models of its joints."""
         return tuple(build.moving_joints(self.model))
 
+    @property
+    def prismatic(self) -> NDArray[np.bool_]:
+        """(n,) mask of prismatic joints: their SI units are m, N and kg."""
+        return build.prismatic(self.model)
+
     @cached_property
     def angles(self) -> JointAngles:
         """Angles of its joints in configurations."""

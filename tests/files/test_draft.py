@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shlex
 import warnings
 from pathlib import Path
 from typing import Any
@@ -701,11 +702,63 @@ def test_a_rotor_without_its_gear_is_not_believed(tmp_path: Path) -> None:
     """Some files give the rotor's own inertia, without the square of the gear's ratio."""
     (tmp_path / "robot.urdf").write_text(urdfs.arm(effort=60.0))
     model = read_urdf(tmp_path / "robot.urdf", floating=False).model
-    model.armature = np.array([5e-5, 7e-5, 0.0, 0.1, 0.0, 0.0])
+    model.armature = np.array([5e-5, 7e-5, 0.0, 0.1, 1e-5, 0.0])
     drives = guess_drives(model, {})
     assert drives.armature.keys() == {"turn", "elbow", "slide_0", "slide_1"}
     assert drives.armature["turn"] == drives.armature["elbow"] > 0.01
-    assert drives.said == ["armature of turn, 5e-05 kg m2: hard to believe, and guessed"]
+    assert drives.said == [
+        "armature of turn, 5e-05 kg m2: hard to believe, and guessed",
+        "armature of slide_0, 1e-05 kg: hard to believe, and guessed",
+    ]
+
+
+def test_limits_that_are_hard_to_believe_are_told_in_the_joints_units(tmp_path: Path) -> None:
+    rail = urdfs.joint("rail", "a", "b", "1 0 0", (0, 0, 0), (0, 1), kind="prismatic", effort=2e4)
+    turn = urdfs.joint("turn", "base", "a", "0 0 1", (0, 0, 0.5), (-1, 1), effort=600.0)
+    links = [urdfs.link(name, 2.0, (0.3, 0.1, 0.1), (0.15, 0, 0)) for name in ("base", "a", "b")]
+    text = urdfs.robot("crane", *links, turn, rail).replace('velocity="6.0"', 'velocity="100"')
+    assert _robot(tmp_path, text).drives.said == [
+        "torque limit of turn, 600 N m: hard to believe",
+        "velocity limit of turn, 100 rad/s: hard to believe",
+        "torque limit of rail, 20000 N: hard to believe",
+        "velocity limit of rail, 100 m/s: hard to believe",
+    ]
+    robot = draft_robot(tmp_path / "robot.urdf").made(armature={"turn": 1.0, "rail": 1e-3})
+    (told,) = (text for text in doubts(robot) if text.startswith("armature of rail"))
+    assert "0.001 kg is hard to believe of a drive of 2e+04 N, too small; 0.02 kg is the least" in told
+
+
+@pytest.mark.parametrize("stages", [1, 2], ids=["one stage", "a second one that follows"])
+def test_the_guessed_torque_holds_an_extended_telescope(tmp_path: Path, stages: int) -> None:
+    """With the promised factor over gravity, horizontal and at its full length, and no more than that."""
+    none = {"effort": 0.0, "velocity": 0.0}
+    parts = [urdfs.link("base", 10.0, (0.2, 0.2, 0.4), (0, 0, 0.2))]
+    parts += [urdfs.link("tube_0", 2.0, (0.3, 0.05, 0.05), (0.15, 0, 0))]
+    parts += [urdfs.joint("shoulder", "base", "tube_0", "0 1 0", (0, 0, 0.5), (-2, 2), **none)]
+    for k in range(stages):
+        parts += [urdfs.link(f"tube_{k + 1}", 1.0, (0.3, 0.05, 0.05), (0.15, 0, 0))]
+        slide = {"kind": "prismatic", **none}
+        parts += [
+            urdfs.joint(f"out_{k}", f"tube_{k}", f"tube_{k + 1}", "1 0 0", (0.3, 0, 0), (0, 3), **slide)
+        ]
+    law = 'joint="out_0" multiplier="0.5" offset="0.2"'
+    robot = _robot(tmp_path, urdfs.following(urdfs.robot("telescope", *parts), "out_1", law)).robot
+    assert robot.joint_names == ("shoulder", "out_0") and len(robot.couplings) == stages - 1
+    out = np.array([0.0, 3.0])
+    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), out)
+    assert robot.torque_limit[0] == pytest.approx(3 * abs(gravity[0]), rel=0.05)  # rounded to two digits
+
+
+@pytest.mark.parametrize("effort", [0.05, 60.0])
+def test_a_guessed_rotor_is_what_the_draft_says(tmp_path: Path, effort: float) -> None:
+    """1 g m2 for each N m, also of motors of some grams."""
+    drives = _robot(tmp_path, urdfs.arm(effort=effort)).drives
+    assert drives.armature == dict.fromkeys(("turn", "shoulder", "elbow", "wrist"), 1e-3 * effort)
+
+
+def test_an_inner_joint_of_six_degrees_of_freedom_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"'turn'.*6 degrees of freedom.*split it"):
+        _robot(tmp_path, urdfs.arm().replace('name="turn" type="revolute"', 'name="turn" type="floating"'))
 
 
 def test_negative_limits_stand_for_none(tmp_path: Path) -> None:
@@ -1040,11 +1093,16 @@ def test_robots_of_example_robot_data_go_by_name() -> None:
 
 def test_the_command_writes_a_file_once(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(urdfs.arm())
-    words = ["new", "--urdf", str(tmp_path / "arm.urdf"), "--out", str(tmp_path / "arm.toml")]
+    out = tmp_path / "my arm.toml"
+    words = ["new", "--urdf", str(tmp_path / "arm.urdf"), "--out", str(out)]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    assert "guessed" in done.output and "impactopt check" in done.output
-    assert read_toml((tmp_path / "arm.toml").read_text())["robot"]["urdf"] == "arm.urdf"
+    assert "guessed" in done.output
+    (commands,) = [line for line in done.output.splitlines() if line.startswith("next: ")]
+    first, then = commands.removeprefix("next: ").split("; then ")
+    assert shlex.split(first) == ["impactopt", "check", str(out)]
+    assert shlex.split(then) == ["impactopt", "solve", str(out)]
+    assert read_toml(out.read_text())["robot"]["urdf"] == "arm.urdf"
     again = CliRunner().invoke(app, words)
     assert again.exit_code == 2 and "already" in again.output
     assert CliRunner().invoke(app, ["new", "punch", "--urdf", "x"]).exit_code == 2

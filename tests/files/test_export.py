@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -20,8 +21,9 @@ import yaml
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from support.fake_solution import still_solution, strike_record
+from support.fake_solution import still_problem, still_solution, strike_record
 from support.small_plans import BODILESS, rod_hammer
+from support.small_robots import biped
 from typer.testing import CliRunner
 
 import impactopt
@@ -43,6 +45,7 @@ from impactopt import (
     Solution,
     SpringDamper,
     Status,
+    Tool,
     load_problem,
     solve,
 )
@@ -277,6 +280,8 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
     assert told["impulse_Ns"] == pytest.approx(replayed(arm.problem, read).impulse, rel=2 * NEAR)
     assert told["impulse_Ns"] == pytest.approx(arm.impulse, rel=0.05)
     assert told["pressing_Ns"] == told["pressing_ms"] == 0
+    ratio = (np.abs(read.torque) / robot.torque_limit).max()
+    assert told["feed_forward_ratio"] == pytest.approx(ratio, rel=0.02) and ratio < 1
     with pytest.raises(InputError, match="bolted robots"):
         still.export("csv", tmp_path / "legs", smooth=limits)
     with pytest.raises(InputError, match="does not hit the target; the plan's swing has up to") as slow:
@@ -303,6 +308,21 @@ def test_a_smoothed_motion_that_presses_on_is_told(arm: Solution, tmp_path: Path
     assert told["impulse_Ns"] + told["pressing_Ns"] == pytest.approx(whole, rel=2 * NEAR)
     with pytest.raises(InputError, match=r"brakes too late: .* then presses on it"):
         arm.export("csv", tmp_path / "late", smooth=(30.0, 500.0))
+
+
+def test_feed_forward_beyond_the_torque_limit_is_told(planned: Planned, tmp_path: Path) -> None:
+    """A smoothed motion that is near the plan's jumps accelerates beyond what its motors can."""
+    path, out, robot = problem_file("arm_planar"), tmp_path / "csv", planned.problem.robot
+    text = path.read_text(encoding="utf-8")
+    save_record(dataclasses.replace(planned.record, problem=text, problem_path=path), tmp_path / "arm")
+    given = ["export", str(tmp_path / "arm"), "--to", "csv", "--out", str(out), "--smooth", "200,50000"]
+    done = runner.invoke(app, [*given, "--no-gravity"])
+    assert "caution: its feed-forward" in done.stdout
+    read = from_csv(out / "motion.csv", robot)
+    data = robot.model.createData()  # the motors produce what the controller adds, too
+    torque = read.torque + [pin.computeGeneralizedGravity(robot.model, data, q) for q in read.q]
+    told = json.loads((out / "meta.json").read_text())["smooth"]["feed_forward_ratio"]
+    assert told == pytest.approx((np.abs(torque) / robot.torque_limit).max(), rel=0.02) and told > 1
 
 
 @pytest.mark.parametrize("rate", [200.0, 50.0])
@@ -536,6 +556,23 @@ def test_mjlab_has_the_kinematics_of_mujoco(arm: Solution, tmp_path: Path) -> No
     np.testing.assert_allclose(motion["joint_vel"][k], rate[0][order], atol=1e-6)
 
 
+def test_mjlab_has_only_the_joints_of_the_robots_file(tmp_path: Path) -> None:
+    """Policies read columns by position, and no file has the joints of soft grips and soles' hinges."""
+    own = biped(5)
+    grip = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5)
+    zero, inertia, head = np.zeros(3), np.full(3, 1e-3), np.array([0.1, 0.0, 0.0])
+    hammer = Tool(name="hammer", frame="fist", mass=0.5, center=zero, inertia=inertia, head=head, grip=grip)
+    robot = own.with_tool(hammer)
+    joints = [name for k, name in enumerate(robot.joint_names) if not robot.passive[k]]
+    assert len(joints) == robot.n - 3
+    solution = still_solution(problem=still_problem(robot=robot, terms=BODILESS))
+    solution.export("mjlab", tmp_path / "m")
+    motion = check_mjlab(solution, tmp_path / "m" / "motion.npz")
+    assert list(motion["joint_names"]) == joints
+    assert motion["joint_pos"].shape[1] == motion["joint_vel"].shape[1] == len(joints)
+    assert motion["body_pos_w"].shape[1] == len(motion["body_names"]) == len(joints) + 1
+
+
 # ---------------------------------------------------------------- a humanoid
 def test_a_punch_replays_from_csv_and_stands(punch: Solution, tmp_path: Path) -> None:
     files = punch.export("csv", tmp_path / "csv")
@@ -683,10 +720,10 @@ def test_the_command_writes_and_lists_files(
     assert told["to"] == "csv" and told["directory"] == str(tmp_path / "arm_csv")
     assert [Path(p).name for p in told["files"]] == ["meta.json", "motion.csv"]
     assert all(Path(p).is_file() for p in told["files"])
-    done = runner.invoke(
-        app, ["export", str(tmp_path / "arm"), "--to", "mujoco", "--out", str(tmp_path / "m")]
-    )
-    assert done.stdout.splitlines()[-2:] == [f"{tmp_path}/m/scene.xml", f"python {tmp_path}/m/play.py"]
+    out = tmp_path / "a scene"
+    done = runner.invoke(app, ["export", str(tmp_path / "arm"), "--to", "mujoco", "--out", str(out)])
+    *_, scene, command = done.stdout.splitlines()
+    assert scene == f"{out}/scene.xml" and shlex.split(command) == ["python", f"{out}/play.py"]
     monkeypatch.chdir(tmp_path / "arm")
     done = runner.invoke(app, ["export", ".", "--to", "mjlab", "--json"])
     assert json.loads(done.stdout)["directory"] == str(tmp_path / "arm_mjlab")

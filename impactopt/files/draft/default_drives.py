@@ -8,12 +8,18 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from impactopt.robots.build import effort_limit, is_floating, joint_indices, joint_names, velocity_limit
-from impactopt.robots.couplings import couplings_of
+from impactopt.robots.build import (
+    effort_limit,
+    is_floating,
+    joint_indices,
+    joint_names,
+    prismatic,
+    velocity_limit,
+)
+from impactopt.robots.couplings import Coupling, axis_of, couplings_of
 from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 
 # by joint type: True for a revolute joint, False for a prismatic one
-MIN_ARMATURE = {True: 1e-3, False: 0.05}  # [kg m2], [kg]
 SPEED = {True: 3.0, False: 0.3}  # guessed velocity limit [rad/s], [m/s]
 RANGE = (-3.14, 3.14)  # [rad] guessed position limits
 MIN_TORQUE = {True: 2.0, False: 50.0}  # [N m], [N]
@@ -30,7 +36,7 @@ DOUBT = "a GUESS"
 @dataclass(kw_only=True)
 class Drives:
     """Guesses by joint: armature [kg m2], torque [N m], velocity [rad/s] and position [rad] limits that the
-    file lacks, or that are too large to be meant.
+    file lacks, or that are too large to be meant. Of prismatic joints [kg], [N], [m/s] and [m].
 
     said : messages about implausible numbers of the file.
     """
@@ -55,48 +61,64 @@ def guess_drives(
     """
     out, joints = Drives(), joint_names(model)
     out.position = {joint: RANGE for joint in joints if joint in unranged}
-    base, indices = model.nv - len(joints), joint_indices(model)
+    base, slides = model.nv - len(joints), prismatic(model)
     torque, speed = effort_limit(model)[base:], velocity_limit(model)[base:]
     gravity = _largest_gravity(model)
     leg_torque = LEVER * 9.81 * sum(float(body.mass) for body in model.inertias)
     for k, joint in enumerate(joints):
-        revolute = "JointModelP" not in model.joints[indices[k]].shortname()
+        revolute = not slides[k]
+        effort, rate, inertia = ("N m", "rad/s", "kg m2") if revolute else ("N", "m/s", "kg")
         limit = known.get(joint, float(torque[k]))
         if not 0 < limit < LARGEST_TORQUE[revolute]:
             least = max(MIN_TORQUE[revolute], leg_torque * (joint in carrying))
             out.torque[joint] = limit = _rounded(max(GRAVITY_FACTOR * gravity[k], least))
         elif limit > PLAUSIBLE_TORQUE[revolute]:
-            unit = "N m" if revolute else "N"
-            out.said.append(f"torque limit of {joint}, {limit:g} {unit}: hard to believe")
+            out.said.append(f"torque limit of {joint}, {limit:g} {effort}: hard to believe")
         if not 0 < speed[k] < LARGEST_SPEED:
             out.velocity[joint] = SPEED[revolute]
         elif speed[k] > PLAUSIBLE_SPEED:
-            out.said.append(f"velocity limit of {joint}, {speed[k]:g} rad/s: hard to believe")
+            out.said.append(f"velocity limit of {joint}, {speed[k]:g} {rate}: hard to believe")
         armature = float(model.armature[base + k])
         if armature < LIGHTEST_ROTOR * limit:  # as of a rotor whose gear ratio is left out
             if armature:
-                out.said.append(f"armature of {joint}, {armature:.2g} kg m2: hard to believe, and guessed")
-            out.armature[joint] = _rounded(max(USUAL_ROTOR * limit, MIN_ARMATURE[revolute]))
+                out.said.append(
+                    f"armature of {joint}, {armature:.2g} {inertia}: hard to believe, and guessed"
+                )
+            out.armature[joint] = _rounded(USUAL_ROTOR * limit)
     return out
 
 
 def _largest_gravity(model: pin.Model) -> list[float]:
     """Upper bound of the gravity torque [N m], [N] of each joint: its subtree stretched out horizontally."""
-    first = 2 if is_floating(model) else 1
-    mass = np.zeros(model.njoints)
-    moment = np.zeros(model.njoints)
+    first, couplings = 2 if is_floating(model) else 1, couplings_of(model)
+    mass, moment, load = np.zeros((3, model.njoints))
     for j in range(model.njoints - 1, first - 1, -1):
         mass[j] += model.inertias[j].mass
         moment[j] += model.inertias[j].mass * float(np.linalg.norm(model.inertias[j].lever))
+        # a joint of more degrees of freedom is refused later, when the robot is made
+        slides = model.joints[j].nv <= 1 and axis_of(model, j).subspace[:3].any()
+        load[j] = mass[j] if slides else moment[j]
         parent, length = int(model.parents[j]), float(np.linalg.norm(model.jointPlacements[j].translation))
+        if slides:
+            length += _travel(model, j, couplings.get(str(model.names[j])))
         mass[parent] += mass[j]
         moment[parent] += moment[j] + mass[j] * length
-    for name, law in couplings_of(model).items():  # the leader's motor carries its followers, too
+    for name, law in couplings.items():  # the leader's motor carries its followers, too
         follower, leader = (model.getJointId(joint) for joint in (name, law.leader))
-        mass[leader] += abs(law.ratio) * mass[follower]
-        moment[leader] += abs(law.ratio) * moment[follower]
-    slides = [(j, "JointModelP" in model.joints[j].shortname()) for j in joint_indices(model)]
-    return [9.81 * float(mass[j] if slide else moment[j]) for j, slide in slides]
+        load[leader] += abs(law.ratio) * load[follower]
+    return [9.81 * float(load[j]) for j in joint_indices(model)]
+
+
+def _travel(model: pin.Model, joint: int, law: Coupling | None) -> float:
+    """Largest distance [m] of a prismatic joint from its zero; 0 without limits.
+
+    law : of a follower, whose limits are its leader's.
+    """
+    k = model.joints[joint].idx_q
+    ends = np.array([model.lowerPositionLimit[k], model.upperPositionLimit[k]])
+    if law is not None:
+        ends = law.ratio * ends + law.offset
+    return float(np.abs(ends).max()) if np.isfinite(ends).all() else 0.0
 
 
 def _rounded(number: float) -> float:

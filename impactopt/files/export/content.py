@@ -212,15 +212,13 @@ class Export:
         )
 
     def _joints(self) -> list[dict[str, Any]]:
-        robot, models = self.robot, self.robot.joint_models
-        out = []
+        robot, out = self.robot, []
         for name, k in zip(self.joints, self.order, strict=True):
-            prismatic = "JointModelP" in models[k].shortname()
             out.append(
                 {
                     "name": name,
                     **({"passive": True} if robot.passive[k] else {}),
-                    "kind": "prismatic" if prismatic else "revolute",
+                    "kind": "prismatic" if robot.prismatic[k] else "revolute",
                     "kp": robot.kp[k],
                     "kd": robot.kd[k],
                     "effort_limit": robot.torque_limit[k],
@@ -276,6 +274,7 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
 
     A motion that cannot brake at contact has its reference behind the target, and presses on it after the
     impact. That impulse is `pressing_Ns`; `pressing_ms` is the time from the impact to the last contact.
+    `feed_forward_ratio` is the largest feed-forward torque, with gravity, over its joint's limit.
 
     Raises
     ------
@@ -305,6 +304,8 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
             f"with {pressing:.3g} N s, until {touches[-1, 1] - touches[0, 0]:.2g} s after the first touch; "
             "give larger limits, or plan with a smaller fraction in [terms.velocity_limit]"
         )
+    driven = ~planned.problem.robot.passive
+    ratio = np.abs(reference.torque[:, driven]) / planned.problem.robot.torque_limit[driven]
     smoothing = {
         "acceleration_rad_s2": within.acceleration,
         "jerk_rad_s3": within.jerk,
@@ -313,6 +314,7 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
         "pressing_Ns": pressing,
         "pressing_ms": 1e3 * max(float(touches[-1, 1] - impact_end), 0.0),
         "touches": len(replayed.touched),
+        "feed_forward_ratio": float(ratio.max()),
     }
     return dataclasses.replace(planned, reference=reference, missed=None), smoothing
 

@@ -42,11 +42,14 @@ def write(export: Export, directory: Path) -> None:
 def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
     """Arrays of mjlab's MotionLoader, and names of joints and bodies.
 
-    The bodies are the root link and the link of each joint, in the order of the joints.
+    The bodies are the root link and the link of each joint, in the order of the joints. Passive joints are
+    left out: no MJCF has them, as soft grips and soles' hinges are added to the robot.
     """
     robot, model = export.robot, export.robot.model
     data, n = model.createData(), len(motion.time)
-    joints = [1 if robot.floating else 0, *(model.getJointId(name) for name in export.joints)]
+    driven = ~robot.passive[export.order]
+    names = np.array(export.joints)[driven]
+    joints = [1 if robot.floating else 0, *(model.getJointId(str(name)) for name in names)]
     place, turn, linear, angular = (np.zeros((n, len(joints), size)) for size in (3, 4, 3, 3))
     for k in range(n):
         pin.forwardKinematics(model, data, *_state(export, motion, k))
@@ -59,13 +62,13 @@ def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
     turn[1:] *= np.where(np.cumsum((turn[1:] * turn[:-1]).sum(-1) < 0, axis=0) % 2, -1.0, 1.0)[..., None]
     return {
         "fps": np.array([export.rate]),
-        "joint_pos": motion.position,
-        "joint_vel": motion.velocity,
+        "joint_pos": motion.position[:, driven],
+        "joint_vel": motion.velocity[:, driven],
         "body_pos_w": place,
         "body_quat_w": turn,
         "body_lin_vel_w": linear,
         "body_ang_vel_w": angular,
-        "joint_names": np.array(export.joints),
+        "joint_names": names,
         "body_names": np.array([body_name(robot, j) for j in joints]),
         **_contacts(export.standing(motion)),
     }

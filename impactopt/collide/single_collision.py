@@ -321,10 +321,8 @@ def collide_once(
     if record is not None and "horizon" not in section.model_fields_set:
         section = section.model_copy(update={"horizon": _horizon(record, section.horizon)})
     robot = content.make_robot(file.path.parent)
-    stance, striker = content.make_stance(robot), content.problem.striker
-    states = ContactStates(
-        robot=robot, striker=striker, stance=stance, start=content.make_start(robot), folder=Path()
-    )
+    striker, (stance, start) = content.problem.striker, content.stance_at_impact(robot)
+    states = ContactStates(robot=robot, striker=striker, stance=stance, start=start, folder=Path())
     model = collision_model(content, robot, stance, section, accuracy)
     head: dict[str, Any] = {"problem": content.problem.name or file.path.stem, "robot": robot.name}
     head |= {"model": section.model}

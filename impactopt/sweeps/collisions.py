@@ -77,13 +77,18 @@ def role_of(place: Place) -> Role:
         return "point"
     if table in ("problem", "robot", "stance", "friction", "at_contact") and rest != ["name"]:
         return "structure"
-    if place == ("collision", "coefficient_of_restitution"):
+    if place == ("collision", "coefficient_of_restitution") or _is_stance(place):
         return "structure"
     key = ".".join(map(str, place))
     raise InputError(
         f"{key}: no collision depends on it; vary it in a sweep of solves, or vary a key of [target], "
-        "[contact], [friction], [at_contact], [robot], [stance] or [problem]"
+        "[contact], [friction], [at_contact], [robot], [stance] or [problem], or soles of [[stances]]"
     )
+
+
+def _is_stance(place: Place) -> bool:
+    """True for soles and steps of a stance phase, not for its duration and spline."""
+    return place[0] == "stances" and place[2:3] in (("soles",), ("steps_m",))
 
 
 def setting_of(place: Place, content: Any) -> str:
@@ -490,14 +495,16 @@ class Collisions:
         """Contact states of a robot on its stance, which several models share."""
         problem, content = file.data["problem"], file.content
         names = [problem.get(name) for name in ("robot", "striker", "start")]
-        key = repr([*names, file.data.get("robot"), file.data.get("stance")])
+        sections = [file.data.get(name) for name in ("robot", "stance", "stances")]
+        key = repr([*names, *sections])
         if key not in self._states:
             robot = content.make_robot(file.path.parent)
+            stance, start = content.stance_at_impact(robot)
             self._states[key] = ContactStates(
                 robot=robot,
                 striker=content.problem.striker,
-                stance=content.make_stance(robot),
-                start=content.make_start(robot),
+                stance=stance,
+                start=start,
                 folder=self.folder,
             )
         return self._states[key]

@@ -28,6 +28,7 @@ from impactopt import (
     striking_velocity,
 )
 from impactopt.collide.contact_states import ContactStates, Posture
+from impactopt.collide.single_collision import collide_once
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.kinematics.stance import Stance
@@ -210,6 +211,48 @@ def test_gains_of_all_joints_leave_a_soft_grip_as_it_is() -> None:
     alone = collide_many(file.changed({"robot.kp": 4000.0}), {}, at_contact=given)
     swept = collide_many(file, {"robot.kp": [4000.0]}, at_contact=given)
     assert swept["reason"][0] == "" and swept["impulse_Ns"] == alone["impulse_Ns"]
+
+
+BOTH, LEFT, RIGHT = ({"soles": soles} for soles in (["left", "right"], ["left"], ["right"]))
+
+
+def with_stance(sections: dict[str, Any], ahead: float = 0.4) -> ProblemFile:
+    """The stand-in's file with other sections and a hit point `ahead` [m]."""
+    data = {**standin_file().data, **sections}
+    data["problem"] = {**data["problem"], "point_m": [ahead, -0.2, 0.9]}
+    return problem_file_from_data(data, where="standin.toml")
+
+
+def test_a_robot_stands_as_in_the_phase_of_the_impact() -> None:
+    outputs, given = ("impulse_Ns", "zmp_margin_m", "sole_force_N"), {"speed_m_s": 0.5}
+    long = {"duration_s": 0.6}
+    phases = with_stance({"stances": [BOTH | long, LEFT, BOTH | long]})
+    found = collide_many(
+        phases, {"stances.1.soles": [["left"], ["right"]]}, outputs=outputs, at_contact=given
+    )
+    for i, sole in enumerate(("left", "right")):
+        one = collide_many(with_stance({"stance": {"soles": sole}}), {}, outputs=outputs, at_contact=given)
+        assert all(found[name][i] == one[name][0] for name in outputs)
+    once = collide_once(phases, given)
+    assert once["sole_force_N"] == pytest.approx(found["sole_force_N"][0], rel=1e-6)
+
+
+def test_a_robot_strikes_from_where_its_steps_lead() -> None:
+    """Both feet step ahead by as much as the hit point is farther."""
+    long, given = {"duration_s": 0.6}, {"speed_m_s": 0.5}
+    left, right = ({"steps_m": {name: [0.15, 0.0]}} for name in ("left", "right"))
+    stances = [BOTH | long, RIGHT | long, BOTH | long | left, LEFT | long, BOTH | right]
+    stepped = collide_many(with_stance({"stances": stances}, 0.55), {}, at_contact=given)
+    still = collide_many(with_stance({}), {}, at_contact=given)
+    assert stepped["impulse_Ns"][0] == pytest.approx(still["impulse_Ns"][0], rel=1e-6)
+
+
+def test_impossible_stance_phases_are_refused_for_a_collision_too() -> None:
+    with pytest.raises(InputError, match="the impact is in one phase"):
+        collide_many(with_stance({"stances": [BOTH, LEFT, BOTH]}), {}, at_contact={"speed_m_s": 0.5})
+    with pytest.raises(InputError, match="no collision depends on it"):
+        phases = with_stance({"stances": [BOTH | {"duration_s": 0.6}, LEFT]})
+        collide_many(phases, {"stances.0.duration_s": [0.7]}, at_contact={"speed_m_s": 0.5})
 
 
 # ---------------------------------------------------------------- states

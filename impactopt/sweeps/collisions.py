@@ -26,6 +26,7 @@ from impactopt.collide.single_collision import (
     chosen,
     collision_model,
     full_names,
+    servo_settings,
 )
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.checks import FREEZE_ERROR, too_large
@@ -41,7 +42,7 @@ from impactopt.files.toml import Place, plain_value
 Role = Literal["number", "point", "structure"]
 
 # Settings of the servo, by the places of factors on them. The robot's own gains are structure: one changes
-# the default of another, and they leave soft grips as they are.
+# the default of another.
 SERVO_SCALES = {
     ("at_contact", "kp_scale"): "kp",
     ("at_contact", "kd_scale"): "kd",
@@ -237,17 +238,15 @@ class CollisionBatch:
 
     def _settings(self, numbers: Numbers) -> dict[str, Array]:
         """Parameters of law, target and servo by their names in `Settings`, (count, ...) or (1, ...)."""
-        section, robot = self.section, self.model.robot
-        out = {"kp": robot.kp[None], "kd": robot.kd[None], "torque_limit": robot.torque_limit[None]}
-        scales: dict[str, Any] = {"kp": section.kp_scale, "kd": section.kd_scale}
-        scales["torque_limit"] = section.torque_limit_scale
+        out, scales = dict[str, Array](), dict[str, Array]()
         for place, values in numbers.items():
             name = SERVO_SCALES.get((str(place[0]), str(place[1])))
             if place[0] in ("target", "contact"):
                 out[setting_of(place, self.file.content)] = values.astype(float)
             elif name is not None:
                 scales[name] = values[:, None]
-        return out | {name: out[name] * scale for name, scale in scales.items()}
+        servo = servo_settings(self.model.robot, self.section, **scales)
+        return out | {name: np.atleast_2d(x) for name, x in servo.items()}
 
 
 def _is_point(place: Place) -> bool:

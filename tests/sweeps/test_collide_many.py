@@ -199,18 +199,38 @@ def test_gains_and_limits_are_the_robots_of_the_file_with_them() -> None:
         assert found["torque_ratio"][i] == pytest.approx(np.abs(one.demand / limit).max(), rel=1e-9)
 
 
-def test_gains_of_all_joints_leave_a_soft_grip_as_it_is() -> None:
-    given = {"posture": "ready", "speed_m_s": 1.0, "model": "full"}
+def soft_grip_file() -> ProblemFile:
+    """The arm with a mallet in a soft grip."""
     mallet = {"name": "mallet", "frame": "wrist", "mass_kg": 0.5, "center_m": [0.2, 0.0, 0.0]}
     mallet |= {"inertia_kg_m2": np.diag([1e-3] * 3).tolist(), "head_m": [0.25, 0.0, 0.0]}
     grip = {"axis": [0.0, 1.0, 0.0], "stiffness_N_m_rad": 10.0, "damping_N_m_s_rad": 0.3}
     soft = {"preset": "planar_arm", "tools": [mallet], "grips": {"mallet": grip}}
     data = {**arm_file().data, "robot": soft}
     data["problem"] = {k: x for k, x in data["problem"].items() if k != "robot"} | {"striker": "mallet"}
-    file = problem_file_from_data(data, where="grip")
+    return problem_file_from_data(data, where="grip")
+
+
+def test_gains_of_all_joints_leave_a_soft_grip_as_it_is() -> None:
+    given, file = {"posture": "ready", "speed_m_s": 1.0, "model": "full"}, soft_grip_file()
     alone = collide_many(file.changed({"robot.kp": 4000.0}), {}, at_contact=given)
     swept = collide_many(file, {"robot.kp": [4000.0]}, at_contact=given)
     assert swept["reason"][0] == "" and swept["impulse_Ns"] == alone["impulse_Ns"]
+
+
+def test_scales_of_the_servo_leave_a_soft_grip_as_it_is() -> None:
+    given, file = {"posture": "ready", "speed_m_s": 1.0, "model": "full"}, soft_grip_file()
+    robot = load_robot("planar_arm")
+    stiff = {f"robot.kp.{name}": 10 * float(kp) for name, kp in zip(robot.joint_names, robot.kp, strict=True)}
+    stiff |= {f"robot.kd.{name}": 2 * float(kd) for name, kd in zip(robot.joint_names, robot.kd, strict=True)}
+    alone = collide_many(file.changed(stiff), {}, at_contact=given)
+    scales = {"kp_scale": 10.0, "kd_scale": 2.0}
+    columns = {f"at_contact.{key}": [scale] for key, scale in scales.items()}
+    swept = collide_many(file, columns, at_contact=given)
+    assert swept["impulse_Ns"][0] == pytest.approx(alone["impulse_Ns"][0], rel=1e-6)
+    once = collide_once(file, {**given, **scales})
+    assert once["impulse_Ns"] == pytest.approx(alone["impulse_Ns"][0], rel=1e-6)
+    as_it_is = collide_many(file, {}, at_contact=given)
+    assert abs(alone["impulse_Ns"][0] / as_it_is["impulse_Ns"][0] - 1) > 1e-3
 
 
 BOTH, LEFT, RIGHT = ({"soles": soles} for soles in (["left", "right"], ["left"], ["right"]))

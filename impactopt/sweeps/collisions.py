@@ -70,7 +70,7 @@ def sweep_place(data: Mapping[str, Any], key: str) -> Place:
 def role_of(place: Place) -> Role:
     """Role of a key at this place in a collision; InputError if it has none."""
     table, *rest = place
-    if table in _TYPE_KEYS:
+    if table in _TYPE_KEYS and rest[:1] != ["body"]:  # a target's body is for clearance
         return "structure" if rest == [_TYPE_KEYS[str(table)]] else "number"
     if place[:2] in SERVO_SCALES or place[:2] in _STATE:
         return "number"

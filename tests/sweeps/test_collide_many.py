@@ -394,6 +394,8 @@ def test_what_is_impossible_says_why() -> None:
         ({"at_contact.joints": [1.0]}, {}, "name one joint"),
         ({"at_contact.joints.elbo": [1.0]}, {}, "did you mean 'elbow'"),
         ({"swing.duration": [1.0]}, {}, "no collision depends on it"),
+        ({"target.body.size": [[0.1, 0.1, 0.1]]}, {}, "no collision depends on it"),
+        ({"target.body.shape": ["box", "ball"]}, {}, "no collision depends on it"),
         ({"target.mass": [1.0, -1.0]}, {}, "give a number > 0"),
         ({"at_contact.kd_scale": [1.0, -1.0]}, {}, "give a number > 0"),
         ({"target.mass": [1.0, 2.0], "contact.damping": [1.0, 2.0, 3.0]}, {}, "columns 3"),

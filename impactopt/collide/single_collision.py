@@ -29,6 +29,8 @@ from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin, zmp
 from impactopt.robots.robot import Robot
 
+Array = NDArray[np.float64]
+
 NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
 _FULL_DYNAMICS_STEP = 1e-4  # [s] between instants of its histories
 _IMPULSE_TOLERANCE = 1e-4  # relative, of the full dynamics
@@ -85,6 +87,22 @@ def check_at_contact(given: Mapping[str, Any]) -> AtContact:
     return section
 
 
+def servo_settings(robot: Robot, section: AtContact, **scales: Array) -> dict[str, Array]:
+    """Stiffness ``kp`` [N m/rad], damping ``kd`` [N m s/rad] and ``torque_limit`` [N m] of the servo.
+
+    Joints without a motor keep theirs: a grip's spring and damper are no servo's.
+
+    scales (N, 1) : by setting, in the place of the section's scale.
+
+    Returns settings (n), or (N, n) with a scale.
+    """
+    given = {"kp": section.kp_scale, "kd": section.kd_scale, "torque_limit": section.torque_limit_scale}
+    return {
+        name: getattr(robot, name) * np.where(robot.passive, 1.0, scale)
+        for name, scale in (given | scales).items()
+    }
+
+
 def collision_model(
     content: CollisionSections, robot: Robot, stance: Stance, section: AtContact, accuracy: float = 1e-2
 ) -> CollisionModel:
@@ -113,8 +131,6 @@ def collision_model(
     options["contact_friction"] = friction
     return frozen_model(section.model, section.freezes, accuracy=accuracy, **options)
 
-
-Array = NDArray[np.float64]
 
 LEAST_WEIGHT = 1.0  # [N] vertical force on the ground; with less the ZMP is undefined
 
@@ -321,10 +337,8 @@ def collide_once(
     if record is not None and "horizon" not in section.model_fields_set:
         section = section.model_copy(update={"horizon": _horizon(record, section.horizon)})
     robot = content.make_robot(file.path.parent)
-    stance, striker = content.make_stance(robot), content.problem.striker
-    states = ContactStates(
-        robot=robot, striker=striker, stance=stance, start=content.make_start(robot), folder=Path()
-    )
+    striker, (stance, start) = content.problem.striker, content.stance_at_impact(robot)
+    states = ContactStates(robot=robot, striker=striker, stance=stance, start=start, folder=Path())
     model = collision_model(content, robot, stance, section, accuracy)
     head: dict[str, Any] = {"problem": content.problem.name or file.path.stem, "robot": robot.name}
     head |= {"model": section.model}
@@ -347,7 +361,7 @@ def collide_once(
     for name in dict.fromkeys(name for m in MEASURES.values() for name in m.outputs):
         value = getattr(collision, name)
         found[name] = None if value is None else np.asarray(value, dtype=float)[None]
-    limit = robot.torque_limit * section.torque_limit_scale
+    limit = servo_settings(robot, section)["torque_limit"]
     batch = CollisionResults(
         found=found,
         states=state,
@@ -396,12 +410,7 @@ def _joints(collision: Collision, robot: Robot, limit: Array) -> list[dict[str, 
 
 
 def _collide(model: CollisionModel, state: States, section: AtContact) -> Collision:
-    robot = model.robot
-    settings = {
-        "kp": robot.kp * section.kp_scale,
-        "kd": robot.kd * section.kd_scale,
-        "torque_limit": robot.torque_limit * section.torque_limit_scale,
-    }
+    settings = servo_settings(model.robot, section)
     settings |= {name: x[0] for name, x in state.reference_settings.items()}
     # a point mass has no servo, and the paper's SDC no stiffness
     known = getattr(model, "settings", settings)

@@ -65,9 +65,9 @@ from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_sec
 from impactopt.problem.stances import (
     StancePhase,
     check_stances,
+    impact_phase,
     names_of,
-    places_of_soles,
-    stepped_posture,
+    phase_coordinates,
 )
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
@@ -388,26 +388,12 @@ class ImpactProblem:
         if not self.stances:
             hands = self.stance.held_hands(robot)
             return (StanceCoordinates(robot, self.stance.soles(robot), start, hands),)
-        # by the names of the soles: where they stand at the start; by names and steps: after these
-        known: dict[Any, StanceCoordinates] = {}
-        out = []
-        for steps in places_of_soles(self.stances, [sole.name for sole in robot.soles]):
-            soles = tuple(robot.sole(name) for name in steps)
-            names, key = tuple(steps), tuple((name, *step) for name, step in steps.items())
-            if names not in known:
-                known[names] = StanceCoordinates(robot, soles, start)
-            if key not in known:
-                c = known[names]
-                if any(step.any() for step in steps.values()):
-                    c = StanceCoordinates(robot, soles, stepped_posture(c, steps))
-                known[key] = c
-            out.append(known[key])
-        return tuple(out)
+        return phase_coordinates(robot, self.stances, start)
 
     @property
     def blow(self) -> int:
         """Index of the stance phase with the impact."""
-        return next((k for k, stance in enumerate(self.stances) if stance.phase is None), 0)
+        return impact_phase(self.stances)
 
     def change_posture(self, k: int) -> Array:
         """Guess of the posture (nq,) between stance phases k and k + 1: all soles of both in place, and the

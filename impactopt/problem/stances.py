@@ -85,15 +85,33 @@ def check_stances(problem: Any) -> None:
     stances, robot = problem.stances, problem.robot
     if not stances:
         return
+    stance = stance_at_impact(robot, stances)
+    if problem.stance.hand_frames(robot):
+        raise InputError("stances: a supporting hand goes with one stance: leave one of them out")
+    object.__setattr__(problem, "stance", stance)
+
+
+def impact_phase(stances: Sequence[StancePhase]) -> int:
+    """Index of the stance phase with the impact, the one without a duration; 0 without phases."""
+    return next((k for k, stance in enumerate(stances) if stance.phase is None), 0)
+
+
+def stance_at_impact(robot: Robot, stances: Sequence[StancePhase]) -> Stance:
+    """Stance of the phase with the impact.
+
+    Raises
+    ------
+    InputError : phases that are not a possible sequence for this robot.
+    """
     if not robot.floating:
         raise InputError(f"robot {robot.name!r} has a fixed base, and no soles to lift: leave `stances` out")
     for stance in stances:
         for name in stance.soles:
             robot.sole(name)
-    of_impact = [stance for stance in stances if stance.phase is None]
-    if len(of_impact) != 1:
+    of_impact = sum(stance.phase is None for stance in stances)
+    if of_impact != 1:
         raise InputError(
-            f"stances: the impact is in one phase, the only one without a duration, but {len(of_impact)} of "
+            f"stances: the impact is in one phase, the only one without a duration, but {of_impact} of "
             f"{names_of(stances)} have none: leave out the duration of this phase, and give one to all others"
         )
     if len(stances) == 1:
@@ -107,11 +125,9 @@ def check_stances(problem: Any) -> None:
                 "lift off or to touch down, not both: put a phase between in which all of these stand"
             )
     _check_steps(stances)
-    if problem.stance.hand_frames(robot):
-        raise InputError("stances: a supporting hand goes with one stance: leave one of them out")
     if robot.sprung.any():
         raise InputError(f"stances: robot {robot.name!r} has soft grips, which go with one stance")
-    object.__setattr__(problem, "stance", _stance(robot, of_impact[0].soles))
+    return _stance(robot, stances[impact_phase(stances)].soles)
 
 
 def _check_steps(stances: Sequence[StancePhase]) -> None:
@@ -140,7 +156,35 @@ def places_of_soles(
         yield {name: moved.get(name, np.zeros(2)) for name in names if name in stance.soles}
 
 
-def stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+def phase_coordinates(
+    robot: Robot, stances: Sequence[StancePhase], start: NDArray[np.float64]
+) -> tuple[StanceCoordinates, ...]:
+    """Independent coordinates of each stance phase.
+
+    start (nq,) : start posture; a phase after steps has the posture of `_stepped_posture`.
+
+    Raises
+    ------
+    InputError : legs that cannot be closed; steps beyond their reach; soles that overlap.
+    """
+    # by the names of the soles: where they stand at the start; by names and steps: after these
+    known: dict[Any, StanceCoordinates] = {}
+    out = []
+    for steps in places_of_soles(stances, [sole.name for sole in robot.soles]):
+        soles = tuple(robot.sole(name) for name in steps)
+        names, key = tuple(steps), tuple((name, *step) for name, step in steps.items())
+        if names not in known:
+            known[names] = StanceCoordinates(robot, soles, start)
+        if key not in known:
+            c = known[names]
+            if any(step.any() for step in steps.values()):
+                c = StanceCoordinates(robot, soles, _stepped_posture(c, steps))
+            known[key] = c
+        out.append(known[key])
+    return tuple(out)
+
+
+def _stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
     """Posture (nq,) of a stance with its soles displaced by ``moved`` (2,) [m].
 
     The base is displaced by the mean of the soles, and lowered if the legs do not reach.

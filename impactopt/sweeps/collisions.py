@@ -26,6 +26,7 @@ from impactopt.collide.single_collision import (
     chosen,
     collision_model,
     full_names,
+    servo_settings,
 )
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.checks import FREEZE_ERROR, too_large
@@ -41,7 +42,7 @@ from impactopt.files.toml import Place, plain_value
 Role = Literal["number", "point", "structure"]
 
 # Settings of the servo, by the places of factors on them. The robot's own gains are structure: one changes
-# the default of another, and they leave soft grips as they are.
+# the default of another.
 SERVO_SCALES = {
     ("at_contact", "kp_scale"): "kp",
     ("at_contact", "kd_scale"): "kd",
@@ -69,7 +70,7 @@ def sweep_place(data: Mapping[str, Any], key: str) -> Place:
 def role_of(place: Place) -> Role:
     """Role of a key at this place in a collision; InputError if it has none."""
     table, *rest = place
-    if table in _TYPE_KEYS:
+    if table in _TYPE_KEYS and rest[:1] != ["body"]:  # a target's body is for clearance
         return "structure" if rest == [_TYPE_KEYS[str(table)]] else "number"
     if place[:2] in SERVO_SCALES or place[:2] in _STATE:
         return "number"
@@ -77,13 +78,18 @@ def role_of(place: Place) -> Role:
         return "point"
     if table in ("problem", "robot", "stance", "friction", "at_contact") and rest != ["name"]:
         return "structure"
-    if place == ("collision", "coefficient_of_restitution"):
+    if place == ("collision", "coefficient_of_restitution") or _is_stance(place):
         return "structure"
     key = ".".join(map(str, place))
     raise InputError(
         f"{key}: no collision depends on it; vary it in a sweep of solves, or vary a key of [target], "
-        "[contact], [friction], [at_contact], [robot], [stance] or [problem]"
+        "[contact], [friction], [at_contact], [robot], [stance] or [problem], or soles of [[stances]]"
     )
+
+
+def _is_stance(place: Place) -> bool:
+    """True for soles and steps of a stance phase, not for its duration and spline."""
+    return place[0] == "stances" and place[2:3] in (("soles",), ("steps_m",))
 
 
 def setting_of(place: Place, content: Any) -> str:
@@ -232,17 +238,15 @@ class CollisionBatch:
 
     def _settings(self, numbers: Numbers) -> dict[str, Array]:
         """Parameters of law, target and servo by their names in `Settings`, (count, ...) or (1, ...)."""
-        section, robot = self.section, self.model.robot
-        out = {"kp": robot.kp[None], "kd": robot.kd[None], "torque_limit": robot.torque_limit[None]}
-        scales: dict[str, Any] = {"kp": section.kp_scale, "kd": section.kd_scale}
-        scales["torque_limit"] = section.torque_limit_scale
+        out, scales = dict[str, Array](), dict[str, Array]()
         for place, values in numbers.items():
             name = SERVO_SCALES.get((str(place[0]), str(place[1])))
             if place[0] in ("target", "contact"):
                 out[setting_of(place, self.file.content)] = values.astype(float)
             elif name is not None:
                 scales[name] = values[:, None]
-        return out | {name: out[name] * scale for name, scale in scales.items()}
+        servo = servo_settings(self.model.robot, self.section, **scales)
+        return out | {name: np.atleast_2d(x) for name, x in servo.items()}
 
 
 def _is_point(place: Place) -> bool:
@@ -490,14 +494,16 @@ class Collisions:
         """Contact states of a robot on its stance, which several models share."""
         problem, content = file.data["problem"], file.content
         names = [problem.get(name) for name in ("robot", "striker", "start")]
-        key = repr([*names, file.data.get("robot"), file.data.get("stance")])
+        sections = [file.data.get(name) for name in ("robot", "stance", "stances")]
+        key = repr([*names, *sections])
         if key not in self._states:
             robot = content.make_robot(file.path.parent)
+            stance, start = content.stance_at_impact(robot)
             self._states[key] = ContactStates(
                 robot=robot,
                 striker=content.problem.striker,
-                stance=content.make_stance(robot),
-                start=content.make_start(robot),
+                stance=stance,
+                start=start,
                 folder=self.folder,
             )
         return self._states[key]

@@ -156,10 +156,11 @@ OBJECTIVES = st.lists(
 
 
 def _undefined_energy(changes: dict[str, Any]) -> bool:
-    """True of the energy of a damped board, which is refused."""
+    """True of the energy of a damped board, which is refused; it is the objective if none is drawn."""
     target = changes.get("target")
     damped = isinstance(target, impactopt.Board) and target.damping > 0
-    return damped and any(type(one) is objectives.TargetEnergy for one in changes.get("objectives", ()))
+    drawn = changes.get("objectives", (objectives.TargetEnergy(),))
+    return damped and any(type(one) is objectives.TargetEnergy for one in drawn)
 
 
 LETTERS = st.characters(exclude_categories=["Cc", "Cs"], include_characters="\n\t")

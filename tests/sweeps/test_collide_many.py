@@ -28,6 +28,7 @@ from impactopt import (
     striking_velocity,
 )
 from impactopt.collide.contact_states import ContactStates, Posture
+from impactopt.collide.single_collision import collide_once
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.kinematics.stance import Stance
@@ -198,18 +199,80 @@ def test_gains_and_limits_are_the_robots_of_the_file_with_them() -> None:
         assert found["torque_ratio"][i] == pytest.approx(np.abs(one.demand / limit).max(), rel=1e-9)
 
 
-def test_gains_of_all_joints_leave_a_soft_grip_as_it_is() -> None:
-    given = {"posture": "ready", "speed_m_s": 1.0, "model": "full"}
+def soft_grip_file() -> ProblemFile:
+    """The arm with a mallet in a soft grip."""
     mallet = {"name": "mallet", "frame": "wrist", "mass_kg": 0.5, "center_m": [0.2, 0.0, 0.0]}
     mallet |= {"inertia_kg_m2": np.diag([1e-3] * 3).tolist(), "head_m": [0.25, 0.0, 0.0]}
     grip = {"axis": [0.0, 1.0, 0.0], "stiffness_N_m_rad": 10.0, "damping_N_m_s_rad": 0.3}
     soft = {"preset": "planar_arm", "tools": [mallet], "grips": {"mallet": grip}}
     data = {**arm_file().data, "robot": soft}
     data["problem"] = {k: x for k, x in data["problem"].items() if k != "robot"} | {"striker": "mallet"}
-    file = problem_file_from_data(data, where="grip")
+    return problem_file_from_data(data, where="grip")
+
+
+def test_gains_of_all_joints_leave_a_soft_grip_as_it_is() -> None:
+    given, file = {"posture": "ready", "speed_m_s": 1.0, "model": "full"}, soft_grip_file()
     alone = collide_many(file.changed({"robot.kp": 4000.0}), {}, at_contact=given)
     swept = collide_many(file, {"robot.kp": [4000.0]}, at_contact=given)
     assert swept["reason"][0] == "" and swept["impulse_Ns"] == alone["impulse_Ns"]
+
+
+def test_scales_of_the_servo_leave_a_soft_grip_as_it_is() -> None:
+    given, file = {"posture": "ready", "speed_m_s": 1.0, "model": "full"}, soft_grip_file()
+    robot = load_robot("planar_arm")
+    stiff = {f"robot.kp.{name}": 10 * float(kp) for name, kp in zip(robot.joint_names, robot.kp, strict=True)}
+    stiff |= {f"robot.kd.{name}": 2 * float(kd) for name, kd in zip(robot.joint_names, robot.kd, strict=True)}
+    alone = collide_many(file.changed(stiff), {}, at_contact=given)
+    scales = {"kp_scale": 10.0, "kd_scale": 2.0}
+    columns = {f"at_contact.{key}": [scale] for key, scale in scales.items()}
+    swept = collide_many(file, columns, at_contact=given)
+    assert swept["impulse_Ns"][0] == pytest.approx(alone["impulse_Ns"][0], rel=1e-6)
+    once = collide_once(file, {**given, **scales})
+    assert once["impulse_Ns"] == pytest.approx(alone["impulse_Ns"][0], rel=1e-6)
+    as_it_is = collide_many(file, {}, at_contact=given)
+    assert abs(alone["impulse_Ns"][0] / as_it_is["impulse_Ns"][0] - 1) > 1e-3
+
+
+BOTH, LEFT, RIGHT = ({"soles": soles} for soles in (["left", "right"], ["left"], ["right"]))
+
+
+def with_stance(sections: dict[str, Any], ahead: float = 0.4) -> ProblemFile:
+    """The stand-in's file with other sections and a hit point `ahead` [m]."""
+    data = {**standin_file().data, **sections}
+    data["problem"] = {**data["problem"], "point_m": [ahead, -0.2, 0.9]}
+    return problem_file_from_data(data, where="standin.toml")
+
+
+def test_a_robot_stands_as_in_the_phase_of_the_impact() -> None:
+    outputs, given = ("impulse_Ns", "zmp_margin_m", "sole_force_N"), {"speed_m_s": 0.5}
+    long = {"duration_s": 0.6}
+    phases = with_stance({"stances": [BOTH | long, LEFT, BOTH | long]})
+    found = collide_many(
+        phases, {"stances.1.soles": [["left"], ["right"]]}, outputs=outputs, at_contact=given
+    )
+    for i, sole in enumerate(("left", "right")):
+        one = collide_many(with_stance({"stance": {"soles": sole}}), {}, outputs=outputs, at_contact=given)
+        assert all(found[name][i] == one[name][0] for name in outputs)
+    once = collide_once(phases, given)
+    assert once["sole_force_N"] == pytest.approx(found["sole_force_N"][0], rel=1e-6)
+
+
+def test_a_robot_strikes_from_where_its_steps_lead() -> None:
+    """Both feet step ahead by as much as the hit point is farther."""
+    long, given = {"duration_s": 0.6}, {"speed_m_s": 0.5}
+    left, right = ({"steps_m": {name: [0.15, 0.0]}} for name in ("left", "right"))
+    stances = [BOTH | long, RIGHT | long, BOTH | long | left, LEFT | long, BOTH | right]
+    stepped = collide_many(with_stance({"stances": stances}, 0.55), {}, at_contact=given)
+    still = collide_many(with_stance({}), {}, at_contact=given)
+    assert stepped["impulse_Ns"][0] == pytest.approx(still["impulse_Ns"][0], rel=1e-6)
+
+
+def test_impossible_stance_phases_are_refused_for_a_collision_too() -> None:
+    with pytest.raises(InputError, match="the impact is in one phase"):
+        collide_many(with_stance({"stances": [BOTH, LEFT, BOTH]}), {}, at_contact={"speed_m_s": 0.5})
+    with pytest.raises(InputError, match="no collision depends on it"):
+        phases = with_stance({"stances": [BOTH | {"duration_s": 0.6}, LEFT]})
+        collide_many(phases, {"stances.0.duration_s": [0.7]}, at_contact={"speed_m_s": 0.5})
 
 
 # ---------------------------------------------------------------- states
@@ -331,6 +394,8 @@ def test_what_is_impossible_says_why() -> None:
         ({"at_contact.joints": [1.0]}, {}, "name one joint"),
         ({"at_contact.joints.elbo": [1.0]}, {}, "did you mean 'elbow'"),
         ({"swing.duration": [1.0]}, {}, "no collision depends on it"),
+        ({"target.body.size": [[0.1, 0.1, 0.1]]}, {}, "no collision depends on it"),
+        ({"target.body.shape": ["box", "ball"]}, {}, "no collision depends on it"),
         ({"target.mass": [1.0, -1.0]}, {}, "give a number > 0"),
         ({"at_contact.kd_scale": [1.0, -1.0]}, {}, "give a number > 0"),
         ({"target.mass": [1.0, 2.0], "contact.damping": [1.0, 2.0, 3.0]}, {}, "columns 3"),

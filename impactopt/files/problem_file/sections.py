@@ -15,7 +15,6 @@ from pydantic import BaseModel, create_model
 
 from impactopt.bodies.world import Ground, Obstacle
 from impactopt.contact.fields import snake_case
-from impactopt.errors import InputError
 from impactopt.files.problem_file.ipopt_options import IpoptOptions
 from impactopt.files.sections.collision import CollisionSection, CollisionSections, ProblemSection, with_kinds
 from impactopt.files.sections.diagnostics import section_at
@@ -36,7 +35,6 @@ from impactopt.files.toml import Place
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario, SecondStriker
-from impactopt.problem.stances import StancePhase
 from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS, TERMS
 from impactopt.simulation.controller import ControllerSettings
 from impactopt.solvers.options import IPMOptions, SolverOptions, SQPOptions
@@ -115,34 +113,6 @@ class SecondSection(Section):
     point: Vector = required("its hit point on the target [m]", "point_m")
 
 
-class StancePhaseSection(Section):
-    """A stance phase: an interval in which the same soles stand."""
-
-    soles: list[str] = required("names of the soles that stand")
-    duration: Duration = optional(
-        "duration [s]; left out of the phase with the impact, which has those of [swing] and [follow]",
-        "duration_s",
-    )
-    intervals: int = optional("intervals of the spline, at least 6, by default 12")
-    grading: AtLeastOne = optional(
-        "longest over shortest interval, the short ones at the contact, by default 3"
-    )
-    steps: dict[str, list[float]] = optional(
-        "by sole that touches down: forward and to the left [m], such as { left = [0.3, 0.0] }",
-        "steps_m",
-    )
-
-    def build(self) -> StancePhase:
-        given = self.given()
-        soles, steps = tuple(given.pop("soles")), given.pop("steps", {})
-        if "duration" not in given and given:
-            raise InputError(
-                f"[[stances]]: the phase on {' and '.join(soles)} has no duration_s: give it one, or leave "
-                f"{' and '.join(given)} out, as for the phase with the impact"
-            )
-        return StancePhase(soles=soles, phase=Phase(**given) if given else None, steps=steps)
-
-
 class PhaseSection(Section):
     """A phase of the motion: its duration and its spline."""
 
@@ -183,7 +153,6 @@ class File(CollisionSections):
     """A whole problem file; `with_kinds` sets the classes of [target] and [contact]."""
 
     second: SecondSection = optional("")
-    stances: list[StancePhaseSection] = optional("")
     swing: SwingSection = optional("")
     follow: FollowSection = optional("")
     collision: CollisionSection = optional("")

@@ -27,7 +27,6 @@ from impactopt.files.problem_file.sections import (
     ScenarioSection,
     SecondSection,
     SolverSettings,
-    StancePhaseSection,
     SwingSection,
     TermSections,
     comment_at,
@@ -40,6 +39,7 @@ from impactopt.files.sections.collision import (
     CollisionSection,
     FrictionSection,
     ProblemSection,
+    StancePhaseSection,
 )
 from impactopt.files.sections.robot import RobotSection
 from impactopt.files.sections.values import Section

@@ -20,7 +20,9 @@ from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
 from impactopt.files.sections.robot import RobotSection
 from impactopt.files.sections.values import (
+    AtLeastOne,
     ContactDuration,
+    Duration,
     Fractions,
     HandNames,
     Positive,
@@ -37,6 +39,8 @@ from impactopt.files.sections.values import (
 )
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, FixedBase, Free, OneSole, Stance
 from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
+from impactopt.problem.scenario import Phase
+from impactopt.problem.stances import StancePhase, impact_phase, phase_coordinates, stance_at_impact
 from impactopt.robots.robot import Robot
 
 _FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # defaults
@@ -140,6 +144,34 @@ class StanceSection(Section):
     )
 
 
+class StancePhaseSection(Section):
+    """A stance phase: an interval in which the same soles stand."""
+
+    soles: list[str] = required("names of the soles that stand")
+    duration: Duration = optional(
+        "duration [s]; left out of the phase with the impact, which has those of [swing] and [follow]",
+        "duration_s",
+    )
+    intervals: int = optional("intervals of the spline, at least 6, by default 12")
+    grading: AtLeastOne = optional(
+        "longest over shortest interval, the short ones at the contact, by default 3"
+    )
+    steps: dict[str, list[float]] = optional(
+        "by sole that touches down: forward and to the left [m], such as { left = [0.3, 0.0] }",
+        "steps_m",
+    )
+
+    def build(self) -> StancePhase:
+        given = self.given()
+        soles, steps = tuple(given.pop("soles")), given.pop("steps", {})
+        if "duration" not in given and given:
+            raise InputError(
+                f"[[stances]]: the phase on {' and '.join(soles)} has no duration_s: give it one, or leave "
+                f"{' and '.join(given)} out, as for the phase with the impact"
+            )
+        return StancePhase(soles=soles, phase=Phase(**given) if given else None, steps=steps)
+
+
 FrictionSection: Any = section_of(ContactFriction)
 
 
@@ -208,7 +240,7 @@ class CollisionSections(Section):
     friction: FrictionSection = optional("")
     second: object = optional("")
     stance: StanceSection = optional("")
-    stances: object = optional("")
+    stances: list[StancePhaseSection] = optional("")
     swing: object = optional("")
     follow: object = optional("")
     collision: RigidSection = optional("")
@@ -257,6 +289,24 @@ class CollisionSections(Section):
             stance = FixedBase()
         stance.constraint_frames(robot)
         return stance
+
+    def stance_at_impact(self, robot: Robot) -> tuple[Stance, NDArray[np.float64]]:
+        """Stance of a robot at the impact, and a posture (nq,) in which its soles stand where they do then.
+
+        They are those of the phase with the impact in [[stances]], after its steps, or of [stance] and the
+        start posture.
+
+        Raises
+        ------
+        InputError : the robot cannot have the stance or the posture, or the phases are not a possible
+            sequence.
+        """
+        stance, start = self.make_stance(robot), self.make_start(robot)
+        if not self.stances:
+            return stance, start
+        phases = [section.build() for section in self.stances]
+        stance = stance_at_impact(robot, phases)
+        return stance, phase_coordinates(robot, phases, start)[impact_phase(phases)].posture
 
     def check_one_striker(self) -> None:
         """InputError if there are two strikers, for commands that compute a collision alone."""

@@ -73,20 +73,21 @@ def slide(problem: ImpactProblem, plan: Plan) -> float:
     postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, CONTACT_SAMPLES)))
     points = np.array([striking_point(problem.robot, problem.striker, q) for q in postures])
     points -= plan.collision.aside(np.linspace(0.0, plan.collision.time[-1], CONTACT_SAMPLES))
-    # From where contact begins, unlike `slides_beyond`, which is about the hit point.
     tangential = (points - points[0]) @ across(problem.normal).T
     return float(np.linalg.norm(tangential, axis=1).max())
 
 
 def slides_beyond(term: Slide, plan: Plan) -> str:
-    """Message with the striking point's offset from the hit point as contact ends; "" if it is within the
-    limit along each tangent, but for a tolerance.
+    """Message with the striking point's slide as contact ends; "" if it is within the limit along each
+    tangent, but for a tolerance.
     """
     problem = plan.problem
+    begin, end = (
+        striking_point(problem.robot, problem.striker, q)
+        for q in plan.closed(plan.through_contact(np.array([0.0, 1.0])))
+    )
     # The constraint bounds the offset along each tangent, so it is a square, not a circle.
-    after = plan.closed(plan.through_contact(np.ones(1)))[0]
-    offset = striking_point(problem.robot, problem.striker, after) - problem.point
-    far = float(np.abs(across(problem.normal) @ offset).max())
+    far = float(np.abs(across(problem.normal) @ (end - begin)).max())
     if far <= (1 + SLIDE_TOLERANCE) * term.most:
         return ""
     most = f"at most {1e3 * term.most:.0f} mm allowed"

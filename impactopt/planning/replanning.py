@@ -29,6 +29,7 @@ from impactopt.problem.violation import Measure
 from impactopt.solvers.predictor import ActiveSystem, Change, Offset, Prediction, Predictor
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.contact_refinement import ContactError
+from impactopt.transcription.contact_state import pulls_apart
 from impactopt.transcription.transcription import Transcription, statement_of
 
 # changes that show whether a program follows its problem: factor of the parameters of law and target, and
@@ -131,7 +132,12 @@ def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
     )
     same_types = type(problem.law) is type(other.law) and type(problem.target) is type(other.target)
     same_types = same_types and problem.target.speed_before() == other.target.speed_before()
-    return same_fields and same_types and (not problem.keeps_apart or same_bodies(problem, other))
+    # a damper adds first instants, and a bound that keeps the force from pulling
+    same_damper = problem.first_instant == other.first_instant and (
+        pulls_apart(problem.law) == pulls_apart(other.law)
+    )
+    same_bodies_apart = not problem.keeps_apart or same_bodies(problem, other)
+    return same_fields and same_types and same_damper and same_bodies_apart
 
 
 def _slightly_changed(problem: ImpactProblem) -> ImpactProblem:

@@ -306,14 +306,15 @@ class Program:
         return float(self.problem.normal @ self.robot.striking(*self.state_at_contact(v))[1])
 
     def _slide(self) -> None:
-        """How far across the target the striker is as contact ends."""
-        p, term, begin = self.problem, self.problem.extra(Slide), self.ways[1].at(0.0)
+        """How far across the target the striker has moved as contact ends."""
+        term, begin, still = self.problem.extra(Slide), self.ways[1].at(0.0), np.zeros(self.robot.ny)
         if term is None or not term.enabled:
             return
         tangents = self._tangents
 
         def value(v: Variables) -> Array:
-            return tangents @ (self.robot.striking(begin(v)[0], np.zeros(self.robot.ny))[0] - p.point)
+            hit, end = (self.robot.striking(y, still)[0] for y in (self.at_contact(v), begin(v)[0]))
+            return tangents @ (end - hit)
 
         names = ["tangent 1", "tangent 2"]
         self.rows.append(Piece.of(value, [(term.name, "after contact", names, -term.most, term.most)]))

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.small_plans import BODILESS, arm_problem
 
 from impactopt import (
     GearLoad,
     HitRegion,
     Impulse,
     InputError,
+    KelvinVoigt,
     Scenario,
     Slide,
     Solution,
@@ -27,7 +29,7 @@ from impactopt import (
 )
 from impactopt.planning import replanning
 from impactopt.planning.budget import Budget
-from impactopt.planning.parameter_changes import changed, parameter_of
+from impactopt.planning.parameter_changes import changed, moved_problem, parameter_of
 from impactopt.planning.replanning import parametric_program
 from impactopt.planning.solution import program_on
 from impactopt.solvers.predictor import Predictor
@@ -214,6 +216,18 @@ def test_what_cannot_be_bent_is_said(arm: Solution) -> None:
         stopped.moved(mass=0.06)
     with pytest.raises(InputError, match="margin"):
         arm.moved(margin=-1.0)
+
+
+def test_a_damper_that_is_new_gets_its_constraints() -> None:
+    """Gear loads at the first instant, with which moving is refused; and a force that does not pull."""
+    elastic, gears = KelvinVoigt(stiffness=2e4, damping=0.0), GearLoad(limit=0.9)
+    problem = replace(arm_problem(), law=elastic, terms=(*BODILESS, gears))
+    with pytest.raises(InputError, match="has other constraints then"):
+        solve(problem, refine=False).moved(damping=3000.0)
+    free = solve(replace(problem, terms=(*BODILESS, replace(gears, enabled=False))), refine=False)
+    damped = moved_problem(free.problem, damping=300.0)
+    wanted = program_on(damped, free.nodes, (), ()).program.x_lower
+    np.testing.assert_array_equal(parametric_program(free).program_for(damped).program.x_lower, wanted)
 
 
 def test_a_plan_that_was_moved_is_freed(arm: Solution) -> None:

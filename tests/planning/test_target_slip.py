@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from support.small_plans import arm_problem, transcribed
+from support.small_plans import BODILESS, arm_problem, transcribed
 
-from impactopt import GearLoad, Plan, Slide, solve
+from impactopt import GearLoad, HitRegion, Plan, Slide, solve
+from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.planning import lazy_constraints
 from impactopt.planning.lazy_constraints import FAR, slide, slide_caution, slides_beyond
 from impactopt.problem import problem as problems
@@ -73,3 +74,19 @@ def test_a_plan_that_slides_too_far_gets_rows(monkeypatch: pytest.MonkeyPatch, p
     assert free.summary()["rows_on_demand"] == []
     assert "allowed" in slides_beyond(Slide(most=most), free.plan)
     assert free.problem.describe()["off"] == ["slide"]
+
+
+def test_in_a_region_a_slide_begins_where_the_striker_hits() -> None:
+    """Not at the middle of the region, which is farther away than a slide may be."""
+    problem = arm_problem()
+    region = HitRegion(size=(0.36, 0.02))
+    aim = problem.point - np.array([0.17, 0.0, 0.0])
+    problem = replace(problem, point=aim, terms=(*BODILESS, region))
+    found = solve(problem, refine=False)
+    assert found.status.usable and found.summary()["rows_on_demand"] == []
+    ends = found.plan.closed(found.plan.through_contact(np.array([0.0, 1.0])))
+    hit, end = (across(problem.normal) @ striking_point(problem.robot, "hand", q) for q in ends)
+    assert np.abs(hit - across(problem.normal) @ aim).max() > 1.5 * Slide().most
+    program = transcribed(replace(problem, terms=(*BODILESS, region, Slide()))).program
+    rows = [i for i in range(program.m) if program.constraint_name(i).startswith("slide")]
+    np.testing.assert_allclose(program.constraints(found.result.x)[rows], end - hit, atol=1e-6)

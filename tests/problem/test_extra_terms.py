@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.small_plans import changed
-from support.term_cases import CASES, MILD, Solved
+from support.term_cases import CASES, MILD, Solved, hit_cone
 
 from impactopt import (
+    FreeMass,
     Gaze,
     HandOrientation,
     HitCone,
     HitRegion,
+    Impulse,
     Incidence,
     InputError,
     Phase,
@@ -107,6 +109,17 @@ def test_the_hit_point_is_free_in_its_region(solved: Any, name: str) -> None:
 def test_any_direction_is_no_better_than_a_cone(solved: Any) -> None:
     free = solved(Incidence(speed=float("inf")))
     assert free.result.objective <= solved(CASES["hit cone"].loose).result.objective + 1e-6
+
+
+def test_a_target_that_comes_meets_a_cone_about_its_own_way(arm_transcription: Transcription) -> None:
+    """A weak impact, for which the hand recedes."""
+    term, ball = HitCone(angle=0.1), FreeMass(mass=1.0, initial_velocity=-1.0)
+    t = changed(arm_transcription, terms=(term,), target=ball, objectives=(Impulse(weight=-1.0),))
+    result = solve(t)
+    assert result.status is Status.SOLVED
+    found = Solved(t, result, t.decode(result.x))
+    assert found.plan.hand_speed < 0
+    assert hit_cone(found, term) <= 1 + 1e-3
 
 
 @pytest.mark.parametrize("robot", ["arm", "biped"])

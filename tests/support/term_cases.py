@@ -95,12 +95,13 @@ def hand_orientation(plan: Solved, term: HandOrientation) -> float:
 
 
 def hit_cone(plan: Solved, term: HitCone) -> float:
-    normal, model = plan.plan.problem.normal, plan.plan.problem.robot.model
-    data = model.createData()
+    problem, model = plan.plan.problem, plan.plan.problem.robot.model
+    normal, data = problem.normal, model.createData()
     v = plan.plan.swing.sample(plan.plan.swing.duration)[1][0]
     pin.forwardKinematics(model, data, plan.posture(1.0), v)
     frame = model.getFrameId("striker:hand")
     velocity = pin.getFrameVelocity(model, data, frame, pin.LOCAL_WORLD_ALIGNED).linear
+    velocity -= float(problem.target.speed_before()) * normal
     return float(np.arccos(normal @ velocity / np.linalg.norm(velocity))) / term.angle
 
 

@@ -24,7 +24,9 @@ TYPICAL = 1.0  # [m/s] speed of a strike, by which the constraint is scaled
 
 @dataclass(frozen=True, kw_only=True)
 class HitCone(Term):
-    """The striking point's velocity at contact lies in a cone about the normal; this replaces `incidence`."""
+    """The striking point's velocity at contact, relative to the target's, lies in a cone about the normal;
+    this replaces `incidence`.
+    """
 
     name: ClassVar[str] = "hit cone"
     unit: ClassVar[str] = "m/s"
@@ -40,9 +42,14 @@ class HitCone(Term):
         return {"hit_cone": BlockRecipe(lambda: hit_cone(coordinates, problem.striker))}
 
     def add_constraints(self, program: Any) -> None:
+
+        def numbers(problem: Any) -> Any:
+            before = float(problem.target.speed_before())
+            return np.array([*face_axes(problem.normal).ravel(), before, np.tan(self.angle)])
+
         y, y1, _ = program.contact_state
-        numbers = np.append(face_axes(program.problem.normal).ravel(), np.tan(self.angle))
-        at = program.add_block("hit_cone", [[y, y1, program.contact_T]], numbers)
+        at = program.add_block("hit_cone", [[y, y1, program.contact_T]], numbers(program.problem))
+        program.builder.follow(lambda b: b.block("hit_cone").take_parameters(numbers(b.problem)))
         program.constraints.add(
             term=self.name,
             place="contact",
@@ -56,16 +63,16 @@ class HitCone(Term):
 def hit_cone(c: StanceCoordinates, striker: str) -> BlockExpression:
     """Margin of the striking point's velocity in its cone.
 
-    z = y, y', T;  p = axes of the face (9, row by row), tangent of the angle;
-    out = ((tangent x speed along the normal)^2 - (speed across it)^2) / (2 tangent x 1 m/s) [m/s].
+    z = y, y', T;  p = axes of the face (9, row by row), speed of the target [m/s], tangent of the angle;
+    out = ((tangent x speed of approach)^2 - (speed across the normal)^2) / (2 tangent x 1 m/s) [m/s].
 
     The squares keep it smooth where there is no speed across the normal. Another constraint requires that the
-    speed along the normal is one of approach.
+    speed of approach is positive.
     """
     y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
-    axes, tangent = ca.SX.sym("axes", 9), ca.SX.sym("tan")
+    axes, before, tangent = ca.SX.sym("axes", 9), ca.SX.sym("before"), ca.SX.sym("tan")
     q, v, _ = c.upper_motion(y, y1 / T, ca.SX.zeros(c.ny))
     velocity = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[1]
     along, *across = ca.vertsplit(ca.mtimes(ca.reshape(axes, 3, 3).T, velocity))
-    room = ((tangent * along) ** 2 - ca.sumsqr(ca.vertcat(*across))) / (2 * tangent * TYPICAL)
-    return make_block([y, y1, T], [axes, tangent], {"room": room}, lanes=2)
+    room = ((tangent * (along - before)) ** 2 - ca.sumsqr(ca.vertcat(*across))) / (2 * tangent * TYPICAL)
+    return make_block([y, y1, T], [axes, before, tangent], {"room": room}, lanes=2)

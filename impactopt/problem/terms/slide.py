@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import casadi as ca
 import numpy as np
 
 from impactopt.contact.fields import about
+from impactopt.kinematics.coordinates import striker_kinematics
 from impactopt.kinematics.operational_space import across
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import millimetres
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +25,8 @@ class Slide(Term):
 
     Its offset along each of two tangents is bounded, with the expected target. With little friction or none,
     a long push at an angle may slide off the target, whose face ends 0.2 m from the hit point in replays. The
-    hit point is where it was before contact, also of a target that friction moves across the normal.
+    hit point is where the striking point meets the target, anywhere in a `HitRegion`; it stays there also on
+    a target that friction moves across the normal.
 
     The term holds with its defaults in every problem. Its constraints are added once a plan violates them, or
     from the start if the problem gives the term, also in strikes.
@@ -31,24 +37,32 @@ class Slide(Term):
     most: float = field(default=0.1, metadata=about("largest offset along each tangent", unit="m", above=0))
     enabled: bool = field(default=True, metadata=about("false: the offset is not bounded"))
 
-    def add_constraints(self, program: Any) -> None:
-        problem = program.problem
-        after = program.follow_spots()[0][1][0]
-        for k, tangent in enumerate(across(problem.normal), start=1):
-            hit = float(tangent @ problem.point)
-            index = len(program.constraints.lower)
-            program.builder.follow(partial(self._follow, index=index, tangent=tangent))
-            program.constraints.add(
-                term=self.name,
-                place="after contact",
-                components=[f"tangent {k}"],
-                outputs=np.array([program.add_block("approach", [[after]], tangent)]),
-                lower=hit - self.most,
-                upper=hit + self.most,
-                measure=millimetres("too far"),
-            )
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        return {"slide": BlockRecipe(lambda: slide(coordinates, problem.striker))}
 
-    def _follow(self, b: Any, index: int, tangent: Any) -> None:
-        """Move the bounds of a constraint to another hit point."""
-        hit = float(tangent @ b.problem.point)
-        b.constraints.bound(index, hit - self.most, hit + self.most)
+    def add_constraints(self, program: Any) -> None:
+        after = program.follow_spots()[0][1][0]
+        slots, tangents = [program.contact_state[0], after], across(program.problem.normal)
+        at = program.add_block("slide", [slots], tangents.ravel())
+        program.constraints.add(
+            term=self.name,
+            place="after contact",
+            components=["tangent 1", "tangent 2"],
+            outputs=at + np.arange(2),
+            lower=-self.most,
+            upper=self.most,
+            measure=millimetres("too far"),
+        )
+
+
+def slide(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """Slide of the striking point across the target during contact.
+
+    z = y at contact, y after it;  p = tangents (6, one after the other);  out = slide along each [m].
+    """
+    y, after = ca.SX.sym("y", c.ny), ca.SX.sym("after", c.ny)
+    tangents, zero = ca.SX.sym("tangents", 6), ca.SX.zeros(c.ny)
+    at = striker_kinematics(c, striker)
+    begin, end = (at(*c.upper_motion(each, zero, zero)[:2], ca.SX.zeros(c.rb.nv))[0] for each in (y, after))
+    moved = ca.mtimes(ca.reshape(tangents, 3, 2).T, end - begin)
+    return make_block([y, after], [tangents], {"moved": moved}, lanes=1)

@@ -184,7 +184,9 @@ def raw_array(name: str, value: object) -> NDArray[Any]:
     import numpy as np
 
     try:
-        return np.asarray(value)
+        array = np.asarray(value)
+        # NumPy would make text of the numbers beside a text
+        return np.asarray(value, dtype=object) if array.dtype.kind in "US" else array
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name}: expected an array, got {shortened(repr(value))}") from error
 

@@ -79,12 +79,12 @@ def collide(
         if not 0 < accuracy < math.inf:
             raise typer.BadParameter(f"{accuracy:g}; give a number > 0", param_hint="--accuracy")
         saved = os.path.isdir(what)  # False also for names that are too long
-        if not saved and speed is None:
-            raise typer.BadParameter("missing; only a result has a speed of its own", param_hint="--speed")
         if saved and posture is not None:
             raise typer.BadParameter("a result has its own; leave it out", param_hint="--posture")
         changes = parse_settings(settings or ())
         read = problem_of_result(what).changed(changes) if saved else CollisionFile.read(what, changes)
+        if not saved and speed is None:
+            raise typer.BadParameter("missing; only a result has a speed of its own", param_hint="--speed")
         if freezes is None and saved and model == "sdc":
             freezes = RESULT_FREEZES
         given = {"model": model, "freezes": freezes, "posture": posture, "speed_m_s": speed}

@@ -28,6 +28,7 @@ from impactopt.files.toml import read_toml
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin, zmp
 from impactopt.robots.robot import Robot
+from impactopt.solvers.program import Status
 
 Array = NDArray[np.float64]
 
@@ -269,6 +270,10 @@ _MODEL_ERRORS = {
     "full": "nothing is frozen; it differs from the replay on fixed soles by the steps of both, and from "
     "the plan by the plan's error between collocation points",
 }
+_NOT_SOLVED = (
+    "the plan is not solved ({}): its numbers violate constraints, and this collision only begins in its "
+    "state at contact"
+)
 
 
 def problem_of_result(result: Path) -> CollisionFile:
@@ -396,6 +401,9 @@ def _saved(file: CollisionFile, section: AtContact, record: Record) -> dict[str,
     saved = planned_numbers(record) if same and not given else {}
     if not saved:
         return {}
+    # an unknown status is of a newer version, as in `keep_record`
+    if (status := record.summary.get("status")) in [s.value for s in Status if not s.usable]:
+        return {"saved": saved, "believe": _NOT_SOLVED.format(status)}
     often = f"at contact and {section.freezes} times during it" if section.freezes else "at contact"
     return {"saved": saved, "believe": _MODEL_ERRORS[section.model].format(often)}
 

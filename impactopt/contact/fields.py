@@ -83,6 +83,9 @@ class About:
         return self.key or f"{field}_{unit}".rstrip("_")
 
 
+_NUMBER = About(what="")  # of fields without metadata
+
+
 def about(what: str, **more: Any) -> dict[str, About]:
     """Metadata of a field, ``mass: float = field(metadata=about("of it", unit="kg", above=0))``.
 
@@ -162,9 +165,11 @@ def numbers_of(instance: Any) -> dict[str, float]:
 def check_numbers(instance: Any) -> None:
     """InputError unless all parameters of a law or a target are numbers in their ranges, or True or False.
 
-    They may not be too large, nor so small that quotients are.
+    They may not be too large, nor so small that quotients are. Fields without a description are numbers too.
     """
-    for field, description in abouts(type(instance)):
+    numbers_of(instance)  # refuses what is no dataclass
+    for field in dataclasses.fields(instance):
+        description = field.metadata.get(_METADATA, _NUMBER)
         unit = f" [{description.unit}]" if description.unit else ""
         name = f"{type(instance).__name__}: {field.name}{unit}"
         value = getattr(instance, field.name)
@@ -201,7 +206,7 @@ def expressions_of(
     try:
         given = method()
         listed = isinstance(given, (list, tuple))
-        right = given is not None and listed == (names is not None)
+        right = given is not None and listed == (names is not None) and not isinstance(given, np.ndarray)
         found = [ca.SX(part) for part in (given if listed else [given])] if right else []
     except Exception as error:
         raise InputError(
@@ -211,12 +216,29 @@ def expressions_of(
     wanted = "one expression" if names is None else f"a list of {len(names)}"
     wanted += f": {', '.join(map(str, names))}" if names else ""
     if not right:
-        kind = "nothing" if given is None else "a list" if listed else "no list"
+        array = "an array" if isinstance(given, np.ndarray) else "no list"
+        kind = "nothing" if given is None else "a list" if listed else array
         raise InputError(f"{where}: {call} gives {kind}; give {wanted}")
     count = sum(part.numel() for part in found)
     if count != (1 if names is None else len(names)) or len(found) != count:
         raise InputError(f"{where}: {call} gives {counted(count, 'expression')}; give {wanted}")
+    if has_nan(ca.veccat(*found)):
+        raise InputError(f"{where}: {call} {IS_NAN}")
     return found
+
+
+IS_NAN = (
+    "has NaN in its expression: functions of Python's math make NaN of CasADi's symbols; write those of "
+    "CasADi, such as casadi.sqrt"
+)
+
+
+def has_nan(expression: Any) -> bool:
+    """True if NaN is a constant of an expression; `math.sqrt` of a CasADi symbol is NaN, not an error."""
+    sx = ca.SX(expression)
+    graph = ca.Function("expression", ca.symvar(sx), [sx])
+    constants = (k for k in range(graph.n_instructions()) if graph.instruction_id(k) == ca.OP_CONST)
+    return any(math.isnan(graph.instruction_constant(k)) for k in constants)
 
 
 def check_parameters_taken(instance: Any, expressions: Iterable[Any]) -> None:

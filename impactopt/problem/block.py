@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
+from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stages import Stage
 
@@ -47,7 +48,13 @@ def make_block(
 
     through : intermediate symbols of ``out``, each with its expression in z and p.  stages : further
         intermediate quantities, each in z, p and those before.
+
+    Raises
+    ------
+    InputError : CasADi's MX in z, p or out.
     """
+    if any(isinstance(part, ca.MX) for part in [*z, *p, *out.values()]):
+        raise InputError("a block has CasADi's MX; write it with SX, as casadi.SX.sym")
     first = [Stage(*(ca.vertcat(*parts) for parts in zip(*through, strict=True)))] if through else []
     return BlockExpression(
         ca.vertcat(*z),

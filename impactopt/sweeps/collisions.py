@@ -415,7 +415,7 @@ class Collisions:
             for key, place in self.places.items():
                 if role_of(place) == "structure":
                     continue
-                values = np.asarray(columns[key])[indices]
+                values = raw_array(key, columns[key])[indices]
                 # allowed numbers are intervals, so the extremes are enough; a NaN is both of them
                 numbers = values.dtype.kind in "fiu"
                 for value in (values.min(axis=0), values.max(axis=0)) if numbers else values:

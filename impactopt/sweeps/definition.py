@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations, cycle, islice
@@ -66,6 +66,19 @@ class VariedKeys:
         self._seen[place] = at
         return ".".join(map(str, place))
 
+    def check_constants(self, section: str, given: Iterable[tuple[str, str]]) -> None:
+        """Checks that no key with one value for all cases varies too.
+
+        section : of the sweep file, "set" or "at_contact".  given : keys in it, each with its key path.
+        """
+        for key, path in given:
+            place = self._place(self._base.data, path)
+            for varied, at in self._seen.items():
+                # a part of a constant may vary, as a coordinate of a point
+                if place[: len(varied)] == varied:
+                    text = f"varies in {'.'.join(map(str, at))}; leave it out"
+                    self._wrong((section, *key.split(".")), text)
+
     @property
     def names(self) -> tuple[str, ...]:
         """Full names of the keys read so far."""
@@ -91,6 +104,9 @@ class VariedKeys:
                 return None
             if section.count is None:
                 self._wrong(at, "how many? give count")
+                return None
+            if section.count == 1 and section.first != section.last:
+                self._wrong(at, "count = 1 leaves out to; give a list of one value, or a larger count")
                 return None
             values: Column = _span_of(section).spread(section.count)
         elif isinstance(what, Sequence) and not isinstance(what, str) and what:
@@ -284,7 +300,8 @@ def parse_sweep(text: str, path: Path, settings: Mapping[str, Any] = MappingProx
         raise InputError(f"{path} is not TOML: {error}") from error
     for key, value in settings.items():
         put(data, key, value)
-    return _checked(data, path, _written(data) if settings else text)
+    lines = key_lines(text) | {tuple(key.split(".")): 0 for key in settings}
+    return _checked(data, path, _written(data) if settings else text, lines)
 
 
 def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = "sweep") -> Sweep:
@@ -294,7 +311,7 @@ def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = 
     except TOMLError as error:
         raise InputError(f"{where}: {error}") from error
     plain: dict[str, Any] = plain_value(data)
-    return _checked(plain, Path(where), _written(plain))
+    return _checked(plain, Path(where), _written(plain), {})
 
 
 def _written(data: Mapping[str, Any]) -> str:
@@ -312,11 +329,14 @@ def _written(data: Mapping[str, Any]) -> str:
     return write_toml({**out, "draw": with_flat(data["draw"], "over")} if "draw" in data else out)
 
 
-def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
-    """Sweep of a file's data; InputError with all mistakes of one stage of the checks."""
+def _checked(data: dict[str, Any], path: Path, text: str, lines: Mapping[Place, int]) -> Sweep:
+    """Sweep of a file's data; InputError with all mistakes of one stage of the checks.
+
+    lines : of the keys in the user's file; 0 for changed values.
+    """
     if found := text_with_control(data):
         raise InputError(f"{path}: the text {shortened(repr(found))} has control characters; take them out")
-    lines, mistakes = key_lines(text), list[Mistake]()
+    mistakes = list[Mistake]()
 
     # called after each stage: a later stage needs a file that has passed the earlier ones
     def raise_if_any() -> None:
@@ -330,8 +350,15 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
     raise_if_any()
     given = content.sweep
     mistakes += of_other_kinds(content)
+    constants = dict(flat(content.set))
+    mistakes += [
+        Mistake(place=("set", *key.split(".")), sections=1, text="give it in the table [at_contact] instead")
+        for key in constants
+        if key.partition(".")[0] == "at_contact"
+    ]
+    raise_if_any()
     # every case is this problem with the values of its varied keys
-    base = read_problem_file(_near(given.problem, path)).changed(dict(flat(content.set)))
+    base = read_problem_file(_near(given.problem, path)).changed(constants)
     reader = VariedKeys(base, mistakes, sweep_place if given.case_kind == "collision" else key_place)
     grid = [a for key, what in flat(content.grid) if (a := reader.axis("grid", key, what)) is not None]
     listed = [a for key, what in flat(content.list) if (a := reader.axis("list", key, what)) is not None]
@@ -341,6 +368,8 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
         name, drawn = reader.name(("draw", "over"), key), reader.drawn(key, what)
         if name is not None and drawn is not None:
             over[name] = drawn
+    reader.check_constants("set", ((key, key) for key in constants))
+    reader.check_constants("at_contact", ((key, f"at_contact.{key}") for key, _ in flat(content.at_contact)))
     if content.draw and not over and not mistakes:
         mistakes.append(Mistake(place=("draw", "over"), sections=2, text="empty; name a key to draw"))
     raise_if_any()

@@ -81,6 +81,10 @@ class Block:
         p, n_p = np.asarray(parameters, dtype=float), f.size1_in(1)
         if p.ndim and p.shape[-1] != n_p:
             raise InputError(f"block {name} takes {n_p} parameters, was given {p.shape[-1]}")
+        if p.ndim == 2 and len(p) not in (1, count):
+            raise InputError(f"block {name} has {count} instances, was given parameters of {len(p)}")
+        if np.isnan(p).any():
+            raise InputError(f"block {name}: a parameter is NaN; give numbers")
         p = np.broadcast_to(p, (count, n_p))
         value, jacobian, hessian = (BatchedFunction(function, count, p) for function in (f, j, h))
         return cls(

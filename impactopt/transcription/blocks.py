@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 
 from impactopt.collision.settings import Effects
+from impactopt.contact.fields import IS_NAN, has_nan
 from impactopt.contact.friction import moves_target
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
@@ -399,12 +400,23 @@ def extra_blocks(
                 raise InputError(f"{where}: there is a block {name!r} already; give it another name")
             if not ca.Function.check_name(name):
                 raise InputError(f"{where}: {name!r} is no name for a function; give letters, digits and _")
-            out[name] = _extra(block, problem, elements)
+            out[name] = _extra(f"{where}: {name!r}", block, problem, elements)
     return out
 
 
-def _extra(block: BlockExpression | BlockRecipe, problem: ImpactProblem, elements: Elements) -> ExtraBlock:
+def _extra(
+    where: str, block: BlockExpression | BlockRecipe, problem: ImpactProblem, elements: Elements
+) -> ExtraBlock:
     if isinstance(block, BlockExpression):
+        inside = ca.vertcat(block.out, *(stage.expression for stage in block.through))
+        known = ca.vertcat(block.z, block.p, *(stage.symbols for stage in block.through))
+        if free := {str(s) for s in ca.symvar(inside)} - {str(s) for s in ca.symvar(known)}:
+            raise InputError(
+                f"{where} has symbols that are neither in its variables nor in its parameters: "
+                f"{', '.join(sorted(free))}; give them to make_block, or replace them by casadi.substitute"
+            )
+        if has_nan(inside):
+            raise InputError(f"{where} {IS_NAN}")
         return ExtraBlock(key_of(block), lambda: block, user=True)
     if block.of_stages:
         stages = len(contact_mesh(problem, elements))

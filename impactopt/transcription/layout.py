@@ -123,6 +123,10 @@ class Affine:
         keep = np.atleast_1d(np.arange(self.size)[index])
         return select(self, keep)
 
+    @property
+    def finite(self) -> bool:
+        return bool(np.isfinite(self.vals).all() and np.isfinite(self.const).all())
+
     def matrix(self, n: int) -> sp.csr_array:
         return sp.csr_array((self.vals, (self.rows, self.cols)), shape=(self.size, n))
 
@@ -410,6 +414,8 @@ class Constraints:
             raise InputError(f"{term}: constraints of nothing; give outputs of a block, or affine, or both")
         out = np.full(n, -1) if outputs is None else np.atleast_1d(np.asarray(outputs, dtype=np.intp))
         lin = Affine.zeros(n) if affine is None else affine
+        if not lin.finite:
+            raise InputError(f"{term}: an affine expression has a number that is not finite")
         for what, count in (("outputs", out.size), ("affine", lin.size)):
             if count != n:
                 raise InputError(f"{term}: {what} are {count}, components {n}; give as many of both")

@@ -48,6 +48,8 @@ def _quantity(program: Any, objective: Objective) -> Quantity:
             f"{type(objective).__name__}.quantity gave {found!r}; give one affine expression, such as "
             "program.swing_T[0], or an impactopt.transcription.objective.Quantity"
         )
+    if not quantity.affine.finite:
+        raise InputError(f"{type(objective).__name__}.quantity has a number that is not finite")
     return quantity
 
 

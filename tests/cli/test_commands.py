@@ -250,6 +250,7 @@ def test_collide_takes_a_saved_result(file: Path, tmp_path: Path) -> None:
     assert "no problem file" in run("collide", tmp_path / "python", code=2)[1]
     (tmp_path / "empty").mkdir()
     run("collide", tmp_path / "empty", code=2)
+    assert "there is no file" in run("collide", tmp_path / "none", code=2)[1], "not that --speed is missing"
 
 
 # ---------------------------------------------------------------- what all of them share

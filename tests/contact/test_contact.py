@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import doctest
 import functools
+import math
 import pickle
 
 import casadi as ca
@@ -378,6 +379,10 @@ def test_a_custom_law_is_its_class_written_out_and_its_numbers_are_inputs():
         ({"compression": lambda x, rate: x**1.5, "analytic": True}, "CustomLaw: analytic: .*analytic=False"),
         ({"compression": lambda x, rate, k: k * x, "k": np.inf}, "CustomLaw: k: inf"),
         ({"compression": lambda x, rate, k: k * x, "k": "soft"}, "CustomLaw: k: expected numbers"),
+        ({"compression": lambda x, rate: np.array([x])}, "gives an array; give one expression"),
+        ({"compression": lambda x, rate: x * math.sqrt(x)}, "has NaN in its expression: .*casadi.sqrt"),
+        ({"compression": lambda x, rate, k: k * ca.log(-x), "k": 1e4}, "0.1 mm deep, is nan N"),
+        ({"compression": lambda x, rate, k: k * x, "k": -1e4}, "is -100 N, .*a force that pushes"),
     ],
 )
 def test_custom_laws_that_cannot_work_are_refused(options, message):
@@ -540,6 +545,7 @@ class Undecorated(ContactLaw):
         (lambda law, x, rate, back, p=None: max(x, 0.0), r"as branch\(penetration.*casadi\.fmax"),
         (lambda law, x, rate, back: x, r"compression: cannot be called .* parameters\)"),
         (lambda law, x, rate, back, p=None: x if back else 2 * x, "agree there"),
+        (lambda law, x, rate, back, p=None: -x, "a force that pushes"),
     ],
 )
 def test_a_law_is_refused_when_it_is_made(branch, message):

@@ -5,6 +5,7 @@ events. The robot is one mass on a rail, with no servo to speak of.
 """
 
 import dataclasses
+import math
 
 import casadi as ca
 import numpy as np
@@ -186,6 +187,14 @@ class Sprung(Target):
         ({"energy": lambda t, z, p=None: max(z[0], 0.0)}, "as energy.*casadi.fmax"),
         ({"energy": lambda t, z, p=None: t.mass * z[0] ** 2}, "do not have mass from .*`parameters`"),
         ({"typical": (1.0,)}, "typical has 1 numbers"),
+        ({"typical": (1.0, float("nan"))}, "typical: nan at index 1"),
+        ({"typical": (1.0, 0.0)}, r"typical is \(1.0, 0.0\); give numbers > 0"),
+        ({"n_states": 2.0}, "n_states is 2.0; give the size of the state, a whole number"),
+        (
+            {"results": ("speed", "speed"), "result": lambda t, z, p=None: [z[0], z[1]]},
+            "results has a name twice: speed, speed",
+        ),
+        ({"result": lambda t, z, p=None: [math.hypot(z[0], z[1])]}, "has NaN in its expression"),
         ({"switches": lambda t, z, f, p=None: f}, "switches.* cannot be called"),
         ({"tangential_mass": lambda t, p=None: max(p["mass"], 1.0)}, "tangential_mass.*casadi.fmax"),
     ],
@@ -194,6 +203,13 @@ def test_a_target_whose_methods_give_what_they_should_not_is_refused_when_it_is_
     assert Sprung(mass=1.0, stiffness=2.0).derivative([0.5, 1.0], 3.0) == [1.0, 0.5]
     with pytest.raises(InputError, match=f"Own.*{message}"):
         type("Own", (Sprung,), changes)(mass=1.0, stiffness=2.0)
+
+
+@pytest.mark.parametrize("mass", ["1.0", float("nan"), [1.0, 2.0]])
+def test_numbers_without_metadata_are_checked(mass):
+    """Text was taken as a number until it was compiled."""
+    with pytest.raises(InputError, match="Sprung: mass: "):
+        Sprung(mass=mass, stiffness=2.0)
 
 
 def test_a_targets_methods_are_checked_once_for_each_class():

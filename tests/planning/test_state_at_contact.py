@@ -421,4 +421,8 @@ def test_the_command_shows_both(tmp_path: Path) -> None:
     for changed in (["--speed", "2"], ["--set", "target.mass_kg=0.5"]):
         other = json.loads(run("--json", *changed))
         assert "saved" not in other and "believe" not in other
-    assert load_record(result).summary["impulse_Ns"] == found["saved"]["planned"]["impulse_Ns"]
+    record = load_record(result)
+    assert record.summary["impulse_Ns"] == found["saved"]["planned"]["impulse_Ns"]
+    save_record(dataclasses.replace(record, summary={**record.summary, "status": "infeasible"}), result)
+    shown = " ".join(run().split())
+    assert "the plan is not solved (infeasible)" in shown and "errors of this model" not in shown

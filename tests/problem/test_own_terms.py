@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, make_dataclass, replace
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -274,6 +275,10 @@ def test_what_a_program_would_know_nothing_of_is_refused(arm_transcription: Tran
         name: ClassVar[str] = ""
 
     problem = arm_transcription.problem
+    # the field's type is a class here, not its name as text
+    low = make_dataclass("Low", [("height", float)], bases=(Term,), frozen=True, kw_only=True)
+    with pytest.raises(InputError, match=r"Low\.height: expected numbers, got 'high'"):
+        low(height="high")
     for terms, words in (
         ((Silent(),), r"Silent has no add_constraints\(program\).*docs/extending.md"),
         ((Term(),), r"Term has no add_constraints\(program\)"),
@@ -300,12 +305,17 @@ def test_what_is_no_block_or_no_quantity_is_refused(arm_transcription: Transcrip
         def blocks(self, problem: Any, coordinates: Any) -> dict[str, Any]:
             return self.wrong
 
-    good = height_of("hand", arm_transcription.coordinates)
+    c = arm_transcription.coordinates
+    good, y, legs = height_of("hand", c), ca.SX.sym("y", c.ny), ca.SX.sym("legs", c.nl)
+    forgotten = make_block([y, legs], [], {"height": c.rb.mass_matrix()[0, 0]})
+    rooted = make_block([y, legs], [], {"height": math.sqrt(y[0])})  # NaN, not an error
     for wrong, words in (
         ({"node": good}, "Odd.blocks: there is a block 'node' already"),
         ({"effort": good}, "Odd.blocks: there is a block 'effort' already"),
         ({"too high": good}, "Odd.blocks: 'too high' is no name for a function"),
         ({"ceiling": lambda y: y}, "Odd.blocks: 'ceiling' is .*make_block"),
+        ({"ceiling": forgotten}, "Odd.blocks: 'ceiling' has symbols .* q_1"),
+        ({"ceiling": rooted}, "Odd.blocks: 'ceiling' has NaN in its expression"),
     ):
         Odd.wrong = wrong
         with pytest.raises(InputError, match=words):
@@ -319,9 +329,19 @@ def test_what_is_no_block_or_no_quantity_is_refused(arm_transcription: Transcrip
         def quantity(self, program: Any) -> Any:
             return 3.0
 
+    with pytest.raises(InputError, match="a block has CasADi's MX; write it with SX"):
+        make_block([ca.MX.sym("y")], [], {"height": ca.MX.sym("y")})
+
     for kind in (Wide, Number):
         with pytest.raises(InputError, match=rf"{kind.__name__}\.quantity gave .*one affine expression"):
             changed(arm_transcription, objectives=(Impulse(), kind(weight=1.0)))
+
+    class Unknown(Pushes):
+        def quantity(self, program: Any) -> Any:
+            return program.swing_T[0] * np.nan
+
+    with pytest.raises(InputError, match=r"Unknown\.quantity has a number that is not finite"):
+        changed(arm_transcription, objectives=(Impulse(), Unknown(weight=1.0)))
 
 
 def test_mistakes_in_rows_are_told_where_they_are_made(arm_transcription: Transcription) -> None:
@@ -329,7 +349,7 @@ def test_mistakes_in_rows_are_told_where_they_are_made(arm_transcription: Transc
 
     class Wrong(Ceiling):
         block: ClassVar[str] = "ceiling"
-        numbers: ClassVar[int] = 0
+        numbers: ClassVar[Any] = 0
         rows: ClassVar[list[Any]] = []
 
         def add_constraints(self, program: Any) -> None:
@@ -353,6 +373,7 @@ def test_mistakes_in_rows_are_told_where_they_are_made(arm_transcription: Transc
         ("rows", [("ab", np.zeros(1, dtype=int))], "ceiling: outputs are 1, components 2"),
         ("rows", [("a", 0), ("b", 0)], "in two constraints, ceiling, a and ceiling, b: "),
         ("numbers", 2, "block ceiling takes 0 parameters, was given 2"),
+        ("numbers", (2, 0), "block ceiling has 1 instances, was given parameters of 2"),
         ("block", "cieling", r"no block 'cieling' \(did you mean 'ceiling'\?\): return it from `blocks`"),
     ):
         setattr(Wrong, attribute, value)

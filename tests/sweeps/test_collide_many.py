@@ -397,6 +397,7 @@ def test_what_is_impossible_says_why() -> None:
         ({"target.body.size": [[0.1, 0.1, 0.1]]}, {}, "no collision depends on it"),
         ({"target.body.shape": ["box", "ball"]}, {}, "no collision depends on it"),
         ({"target.mass": [1.0, -1.0]}, {}, "give a number > 0"),
+        ({"target.mass": [1.0, "heavy"]}, {}, "mass_kg: 'heavy'; give a number"),
         ({"at_contact.kd_scale": [1.0, -1.0]}, {}, "give a number > 0"),
         ({"target.mass": [1.0, 2.0], "contact.damping": [1.0, 2.0, 3.0]}, {}, "columns 3"),
         ({"target.mass": [1.0], "target.mass_kg": [1.0]}, {}, "two columns are of one key"),

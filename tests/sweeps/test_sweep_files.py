@@ -143,6 +143,16 @@ def test_settings_stand_in_for_what_the_file_says(tmp_path: Path) -> None:
             read_sweep_file(written(tmp_path), {key: value})
 
 
+def test_a_setting_that_varies_is_refused_without_a_line_that_no_file_has(tmp_path: Path) -> None:
+    """The command's --set changed nothing where the grid has the key."""
+    with pytest.raises(InputError, match=r"sweep\.toml, as set, \[set\] target\.mass: varies in grid"):
+        read_sweep_file(written(tmp_path), {"set.target.mass": 8.0})
+    coordinate = read_sweep_file(
+        written(tmp_path), {"set.problem.point": [0.7, 0.0, 0.8], "grid.problem.point.0": [0.6]}
+    )
+    assert coordinate.design.cases == 2, "a coordinate of a constant point may vary"
+
+
 def test_sweeps_of_the_package_go_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     found = read_sweep_file("collision_target")
@@ -190,6 +200,9 @@ def test_keys_and_values_are_the_problem_files(tmp_path: Path) -> None:
             "must be > 0 for a log",
         ),
         ("[draw]\ncount = 3\nover.target.resistance = {from = 1.0, count = 2}", "to: missing"),
+        ("[list]\ntarget.resistance = {from = 1.0, to = 2.0, count = 1}", "count = 1 leaves out to"),
+        ("[set]\ntarget.mass = 3.0", "line 11, [set] target.mass: varies in grid.target.mass_kg"),
+        ("[set]\nat_contact.speed = 3.0", "[set] at_contact.speed: give it in the table [at_contact]"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, more: str, wrong: str) -> None:

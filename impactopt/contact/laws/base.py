@@ -54,7 +54,7 @@ class ContactLaw(Described, ABC):
         self._check_branches("branch(penetration, rate, compressing, parameters)")
 
     def _check_branches(self, call: str) -> None:
-        """InputError unless both branches take CasADi expressions and agree where the rate is zero.
+        """InputError unless both branches take CasADi expressions, and push and agree where the rate is zero.
 
         call : how they are called, for the message.
         """
@@ -72,13 +72,23 @@ class ContactLaw(Described, ABC):
             if own_fields:
                 check_parameters_taken(self, found)
             type(self)._symbolic = True
-        for depth in _DEPTHS:
-            there, back = (float(self.branch(depth, 0.0, compressing)) for compressing in phases)
+        forces = {depth: [float(self.branch(depth, 0.0, c)) for c in phases] for depth in _DEPTHS}
+        for depth, (there, back) in forces.items():
+            if not np.isfinite([there, back]).all():
+                raise InputError(
+                    f"{name}: the force at rate zero, {1e3 * depth:g} mm deep, is {there:g} N in compression "
+                    f"and {back:g} N in restitution; give finite ones"
+                )
             if abs(there - back) > _SAME * max(abs(there), abs(back)):
                 raise InputError(
                     f"{name}: the force at rate zero, {1e3 * depth:g} mm deep, is {there:g} N in compression "
                     f"and {back:g} N in restitution: write branches that agree there"
                 )
+        if np.max([*forces.values()]) < 0:
+            raise InputError(
+                f"{name}: the force at rate zero, {1e3 * depth:g} mm deep, is {there:g} N, and negative at "
+                "smaller depths too, so that nothing is hit; give a force that pushes, which is positive"
+            )
 
     @property
     def parameters(self) -> dict[str, float]:

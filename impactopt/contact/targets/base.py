@@ -22,7 +22,7 @@ from impactopt.contact.fields import (
     with_symbols,
 )
 from impactopt.contact.laws.base import ContactLaw
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_array
 
 UNITS = {"speed": "m_s", "depth": "m"}  # units of targets' results
 
@@ -74,6 +74,11 @@ class Target(Described, ABC):
         fields from their argument `parameters`.
         """
         name, target = type(self).__name__, with_symbols(self)
+        n_states = getattr(self, "n_states", None)
+        if not isinstance(n_states, int) or n_states < 0:
+            raise InputError(f"{name}: n_states is {n_states!r}; give the size of the state, a whole number")
+        if len({*self.results}) < len(self.results):
+            raise InputError(f"{name}: results has a name twice: {', '.join(self.results)}")
         state, force, numbers = self._symbols()
         rates = [f"the rate of state[{i}]" for i in range(self.n_states)]
         for method, call, arguments, names in (
@@ -88,6 +93,8 @@ class Target(Described, ABC):
                 f"{name}: typical has {len(self.typical)} numbers; give {self.n_states}, one for each of the "
                 "state"
             )
+        if self.typical and not (check_array(f"{name}: typical", self.typical, (None,)) > 0).all():
+            raise InputError(f"{name}: typical is {self.typical}; give numbers > 0")
         try:
             every = [x for part in target._expressions().values() for x in part]
             ca.veccat(*every)

@@ -59,7 +59,9 @@ class Term(Described):
 
     def _check(self, field: Field[Any], about: About) -> None:
         """Check a field's value, and replace numbers by floats; fields of other types are not checked."""
-        value, kind = getattr(self, field.name), str(field.type)
+        value = getattr(self, field.name)
+        # a class, unless annotations are text, as with `from __future__ import annotations`
+        kind = field.type.__name__ if isinstance(field.type, type) else str(field.type)
         if kind == "bool":
             if not isinstance(value, (bool, np.bool_)):
                 where = f"{type(self).__name__}.{field.name}"

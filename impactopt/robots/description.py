@@ -105,12 +105,14 @@ class Description:
         """Invert couplings whose leader comes after the follower in the tree, in place.
 
         Pinocchio needs leaders first. The motor's numbers (gains, torque and velocity limits) move from the
-        old leader to the new one, reflected by the ratio. A coupling with a locked joint is not inverted: the
-        other joint keeps its own motor.
+        old leader to the new one, reflected by the ratio, unless only the new one has an actuator. A coupling
+        with a locked joint is not inverted: the other joint keeps its own motor.
         """
         model, fixed = self.model, set(locked)
         followers = {tie.follower for tie in self.ties if fixed.isdisjoint(tie.joints)}
-        for k, tie in enumerate(self.ties):
+        # the first of several followers leads, so that the others come after it
+        for k in sorted(range(len(self.ties)), key=lambda k: model.getJointId(self.ties[k].follower)):
+            tie = self.ties[k]
             law = tie.coupling
             if (
                 law is None
@@ -123,10 +125,17 @@ class Description:
             own, other = (model.joints[model.getJointId(joint)] for joint in (tie.follower, law.leader))
             if own.id > other.id or not own.nq == other.nq == 1:
                 continue
-            note = f"{tie.text}, which comes after it in the tree: {tie.follower!r} leads, with its motor"
+            drives, driven = (joint in self.driven for joint in (law.leader, tie.follower))
+            motor = f"the motor of {law.leader!r}" if drives or not driven else "its own motor"
+            left_out = f"; the actuator of {tie.follower!r} is left out" if drives and driven else ""
+            leads = f"{tie.follower!r} leads, with {motor}{left_out}"
+            note = f"{tie.text}, which comes after it in the tree: {leads}"
             inverse = (-law.offset / law.ratio, 1 / law.ratio)
             self.ties[k] = replace(tie, follower=law.leader, follows=inverse, note=note)
             followers ^= {tie.follower, law.leader}
+            if driven and not drives:
+                self.idle = [joint for joint in self.idle if joint != law.leader]
+                continue
             ratio, speed = abs(law.ratio), velocity_limit(model)
             effort = float(effort_limit(model)[other.idx_v])
             if 0 < effort < np.finfo(float).max:  # Pinocchio has the largest double for a missing limit
@@ -139,9 +148,9 @@ class Description:
             if not speed[own.idx_v] > 0:  # many files have no velocity limit, or 0, for a follower
                 speed[own.idx_v] = ratio * speed[other.idx_v]
                 set_velocity_limit(model, speed)
-            self.idle = [joint for joint in self.idle if joint != tie.follower]
             for names in (self.driven, self.idle):
-                names[:] = [tie.follower if joint == law.leader else joint for joint in names]
+                others = [joint for joint in names if joint != tie.follower]
+                names[:] = [tie.follower if joint == law.leader else joint for joint in others]
 
     def moving(self, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
         """The model without locked joints, with the supported couplings.

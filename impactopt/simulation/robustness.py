@@ -20,6 +20,7 @@ from impactopt.simulation import Perturbation, Scene, Simulation, scene_of, simu
 from impactopt.simulation.controller import ControllerSettings
 from impactopt.simulation.engines import check_steps, with_step_error
 from impactopt.simulation.mujoco_world import mujoco_module
+from impactopt.simulation.perturbation import MIN_PAYLOAD
 from impactopt.simulation.workers import map_on_workers
 
 Array = NDArray[np.float64]
@@ -99,6 +100,7 @@ def draw_perturbations(n: int, seed: int = 0, ranges: PerturbationRanges | None 
         # log-uniform, or uniform
         value = low * (high / low) ** u if name in LOGARITHMIC else low + (high - low) * u
         columns[name] = np.clip(value, low, high)  # against rounding
+    columns["payload"][columns["payload"] < MIN_PAYLOAD] = 0.0
     return [_changed(planned, {name: float(value[k]) for name, value in columns.items()}) for k in range(n)]
 
 
@@ -300,7 +302,8 @@ def robustness(
     draws, seed, ranges : as in :func:`draw_perturbations`; a wall has no mass, so that none is drawn.
     workers : number of processes, on which results do not depend. A script that asks for more than 1 needs
         `if __name__ == "__main__":`.
-    controller : settings of a whole-body controller; None: the joints' servo.
+    controller : settings of a whole-body controller, whose rate takes the place of the ranges' period; None:
+        the joints' servo.
     step [s] : of the simulation; shorter where the impulse needs it, as in `validate`.
     progress : called with the number of finished replays, and of all.
 
@@ -314,6 +317,8 @@ def robustness(
     """
     scene = scene_of(problem)
     chosen = (ranges if ranges is not None else PerturbationRanges()).of(scene)
+    if controller is not None:
+        chosen = replace(chosen, period=0.0)
     perturbations = draw_perturbations(draws, seed, chosen)
     if workers < 1:
         raise InputError(f"{workers} workers; ask for at least 1")

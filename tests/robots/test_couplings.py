@@ -280,6 +280,42 @@ def test_who_comes_before_a_leader_leads_it_by_the_inverse_law(tmp_path: Path) -
     assert made.source is not None and "'shoulder' leads" in "; ".join(made.source.notes)
 
 
+def test_two_followers_of_a_later_leader_in_any_order(tmp_path: Path) -> None:
+    """The first joint leads, whichever the file has first."""
+    laws = [("shoulder", 'joint="wrist" multiplier="2"'), ("elbow", 'joint="wrist" multiplier="-1"')]
+    one, other = (described(tmp_path, *order) for order in (laws, laws[::-1]))
+    assert one.couplings == other.couplings
+    assert one.couplings["wrist"] == pytest.approx(("shoulder", 0.5, 0.0))
+    close(one.torque_limit, other.torque_limit)
+
+
+@pytest.mark.parametrize(
+    ("motors", "limit", "said"),
+    [
+        ({"j1": 50.0}, 50.0, "with its own motor"),
+        ({"j2": 8.0}, 4.0, "with the motor of 'j2'"),
+        ({"j1": 50.0, "j2": 8.0}, 4.0, "with the motor of 'j2'; the actuator of 'j1' is left out"),
+    ],
+)
+def test_who_leads_has_the_motor_that_its_note_says(
+    motors: dict[str, float], limit: float, said: str, tmp_path: Path
+) -> None:
+    """j1 = 2 j2, in an MJCF whose motors are told by the torque that they have."""
+    link = '<geom type="capsule" fromto="0 0 0 0 0 .3" size=".03" mass="1"/>'
+    joints = [f'<joint name="{joint}" axis="0 1 0" range="-90 90"/>{link}' for joint in ("j1", "j2")]
+    actuators = "".join(f'<motor joint="{j}" ctrlrange="-{most} {most}"/>' for j, most in motors.items())
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        f"""<mujoco><worldbody><body><geom size=".1"/><body pos="0 0 .1">{joints[0]}
+        <body pos="0 0 .3">{joints[1]}</body></body></body></worldbody>
+        <equality><joint joint1="j1" joint2="j2" polycoef="0 2 0 0 0"/></equality>
+        <actuator>{actuators}</actuator></mujoco>"""
+    )
+    robot = Robot.from_mjcf(path, velocity_limit=5.0)
+    assert robot.torque_limit == pytest.approx([limit])
+    assert robot.source is not None and "; ".join(robot.source.notes).endswith(said)
+
+
 @pytest.mark.parametrize("locked", ["shoulder", "elbow"])
 def test_a_locked_leader_or_follower_leaves_the_other_joint_its_own_motor(
     locked: str, tmp_path: Path

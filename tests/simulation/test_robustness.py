@@ -25,6 +25,7 @@ from impactopt import (
     SpringDamper,
     draw_perturbations,
 )
+from impactopt.simulation import ControllerSettings
 from impactopt.simulation import workers as _workers
 from impactopt.simulation.robustness import LOGARITHMIC, robustness
 from impactopt.simulation.workers import map_on_workers
@@ -53,6 +54,12 @@ def test_factors_are_as_often_halved_as_doubled() -> None:
 def test_a_seed_makes_the_draws_and_fewer_are_the_first_of_more() -> None:
     assert draw_perturbations(5, seed=7) == draw_perturbations(9, seed=7)[:5]
     assert draw_perturbations(5, seed=7) != draw_perturbations(5, seed=8)
+
+
+def test_no_payload_is_lighter_than_one_may_be() -> None:
+    """One of these was drawn with a payload of less than a milligram, which is refused."""
+    ranges = PerturbationRanges(payload=(0.0, 1e-4))
+    assert all(d.payload == 0 or d.payload >= 1e-6 for d in draw_perturbations(500, ranges=ranges))
 
 
 def test_parameters_are_drawn_independently() -> None:
@@ -201,6 +208,12 @@ def test_what_is_drawn_reaches_the_replay(still: tuple[Any, Any]) -> None:
     falls = robustness(*still, 1.0, draws=1, ranges=weak, workers=1, step=STEP)
     assert falls.rate == 0.0 and falls.reason[0].startswith("fell")
     assert falls.lift[0] >= 0.0 and np.isfinite(falls.slip[0])
+
+
+def test_a_controller_has_its_own_rate(still: tuple[Any, Any]) -> None:
+    slow = ControllerSettings(rate=250.0)
+    result = robustness(*still, 1.0, draws=1, workers=1, step=STEP, controller=slow)
+    assert result.perturbations[0].period == result.drawn_from.period == 0
 
 
 def test_of_a_wall_no_mass_is_drawn(still: tuple[Any, Any]) -> None:

@@ -130,6 +130,18 @@ def test_a_law_that_does_not_fit_is_told() -> None:
     assert any("not white noise" in caution for caution in found.cautions)
 
 
+def test_a_motion_that_does_not_fit_is_told() -> None:
+    """A free target taken for a fixed one: the more noise a speed has, the more of that is left in it."""
+    log = log_of(TrueBlow("Kelvin-Voigt", target_mass=6.0), noise=0.01, seed=3)
+    assert log.speed is not None
+    noise = 0.05 * np.random.default_rng(0).normal(size=len(log.time))
+    log = dataclasses.replace(log, speed=log.speed + noise)
+    wrong, right = (identify(log, laws=["Kelvin-Voigt"], target_mass=mass) for mass in (np.inf, 6.0))
+    assert wrong.best.motion_correlation > 0.3 > abs(right.best.motion_correlation)
+    assert any("residual motion of Kelvin-Voigt" in caution for caution in wrong.cautions)
+    assert not any("white noise" in caution for caution in right.cautions)
+
+
 def test_a_law_of_ones_own() -> None:
     law = CustomLaw(
         compression=lambda x, rate, k, d: k * x + d * rate,

@@ -27,6 +27,7 @@ from impactopt.files.sections.values import Positive, Section
 from impactopt.files.toml import read_toml
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin, zmp
+from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import Status
 
@@ -133,22 +134,21 @@ def collision_model(
     return frozen_model(section.model, section.freezes, accuracy=accuracy, **options)
 
 
-LEAST_WEIGHT = 1.0  # [N] vertical force on the ground; with less the ZMP is undefined
+LEAST_LOAD = 1e-3  # vertical force on the ground over the weight; with less the ZMP is undefined
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CollisionResults:
     """Results of N collisions of a robot, from which measures are computed.
 
-    found : outputs by name, as of `SymbolicModel.batch`.  states : at contact.  torque_limit (N, n) or (1, n)
-        [N m].
-    velocity_limit (n) [rad/s].  polygon (k, 2) [m] : support polygon.
+    found : outputs by name, as of `SymbolicModel.batch`.  states : at contact.  robot : that collides.
+    torque_limit (N, n) or (1, n) [N m].  polygon (k, 2) [m] : support polygon.
     """
 
     found: Mapping[str, Array]
     states: States
+    robot: Robot
     torque_limit: Array
-    velocity_limit: Array
     polygon: Array
 
 
@@ -167,15 +167,15 @@ def _torque_ratio(batch: CollisionResults) -> Array:
 
 
 def _velocity_ratio(batch: CollisionResults) -> Array:
-    joints = np.abs(batch.states.v[:, -batch.velocity_limit.size :])
-    return np.asarray((joints / batch.velocity_limit).max(axis=1))
+    joints = np.abs(batch.states.v[:, -batch.robot.n :])
+    return np.asarray((joints / batch.robot.velocity_limit).max(axis=1))
 
 
 def _zmp_margin(batch: CollisionResults) -> Array:
     ground = batch.found["ground_wrench"]
     flat = ground.reshape(-1, 6)
     out = np.full(len(flat), -np.inf)
-    stands = flat[:, 2] > LEAST_WEIGHT
+    stands = flat[:, 2] > LEAST_LOAD * weight_of(batch.robot)
     out[stands] = margin(batch.polygon, zmp(flat[stands]))
     return out.reshape(ground.shape[:2]).min(axis=1)
 
@@ -199,7 +199,7 @@ MEASURES: Mapping[str, Measure] = {
     "zmp_margin_m": Measure(
         outputs=("ground_wrench",),
         what="least distance of the ZMP from the soles' hull, positive inside, at every millisecond of "
-        "contact; minus infinity where the soles would have to pull",
+        "contact; minus infinity where they carry no load, or would have to pull",
         of=_zmp_margin,
     ),
     "sole_force_N": Measure(
@@ -370,8 +370,8 @@ def collide_once(
     batch = CollisionResults(
         found=found,
         states=state,
+        robot=robot,
         torque_limit=limit[None],
-        velocity_limit=robot.velocity_limit,
         polygon=posture.polygon,
     )
     available = {name: m for name, m in MEASURES.items() if all(found[o] is not None for o in m.outputs)}

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from impactopt.codegen.files import read_archive, read_plain
 from impactopt.errors import InputError
-from impactopt.files.record_schema import check_arrays, check_summary
+from impactopt.files.record_schema import check_arrays, check_soles, check_summary
 
 FORMAT = 2  # of solution.npz; increased by a change that an older reader would misread
 # Names of the program's statement since format 2, by those of format 1.
@@ -128,6 +128,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
             arrays["program_statement"] = np.array(_renamed(str(arrays["program_statement"])))
         check_summary(summary, whole="joints" in arrays)
         check_arrays(arrays)
+        check_soles(arrays, summary)
     except InputError:
         raise
     except (FileNotFoundError, NotADirectoryError) as error:

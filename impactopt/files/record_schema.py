@@ -16,7 +16,7 @@ from impactopt.errors import has_control
 
 # Shapes of arrays. Letters are sizes: n, nq and nv are the robot's, the same in all arrays; others are the
 # same in all arrays of one prefix. "?" at the beginning: the array may be missing, as in records of older
-# versions, or empty.
+# versions, or empty, together with the others of this shape and prefix.
 _MOTION = {"time": "k", "q": "k nq"}
 _REFERENCE = {
     **_MOTION,
@@ -45,6 +45,7 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
     | {"gear": "? k n"},
     "replayed": {**_MOTION, **_HISTORIES, "soles": "s"},
     "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"}
+    | {"ground": "g 6", "sole_wrench": "g w"}
     | dict.fromkeys(("velocity", "acceleration"), "? p n")
     | {"tangential_velocity": "? m 3"},
     "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "normal": "3", "contact": ""}
@@ -221,9 +222,10 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
         if not any(name in arrays for name in (full_names.values() if prefix else known)):
             continue
         sizes = {letter: size for letter, size in sizes.items() if letter in _ROBOT}
+        given = {shape for name, shape in shapes.items() if np.size(arrays.get(full_names[name], ()))}
         for name, shape in shapes.items():
             full = full_names[name]
-            if shape.startswith("?") and not np.size(arrays.get(full, ())):
+            if shape.startswith("?") and shape not in given:
                 continue
             _check_shape(full, arrays, shape.strip("? ").split(), sizes)
             if name in _FINITE and not np.all(np.isfinite(arrays[full])):
@@ -232,6 +234,15 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
             time = arrays[full_names["time"]]
             if not len(time) or np.any(np.diff(time) < 0):
                 raise ValueError(f"{full_names['time']} does not rise")
+
+
+def check_soles(arrays: Mapping[str, NDArray[Any]], summary: Mapping[str, Any]) -> None:
+    """ValueError for a sole, also one of the summary's stance phases, without corners (c, 2) [m]."""
+    names = {name for phase in summary.get("stances") or [] for name in phase["soles"]}
+    for name in sorted({f"sole_{name}" for name in names} | {x for x in arrays if x.startswith("sole_")}):
+        _check_shape(name, arrays, ["c", "2"], {})
+        if not arrays[name].size or not np.all(np.isfinite(arrays[name])):
+            raise ValueError(f"{name} has no corners, or some that are not finite")
 
 
 def _check_shape(

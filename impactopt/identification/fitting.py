@@ -395,32 +395,30 @@ def _fit_single(fit: _Fit) -> tuple[Array, tuple[float, float]]:
 
 
 # ---------------------------------------------------------------- results
-def _parts(fit: _Fit, residuals: Array) -> tuple[Array, Array]:
-    """Residuals of force [N], without clipped samples, and of motion [m/s] or [m], of all impacts."""
-    force, motion, begin = [], [], 0
+def _parts(fit: _Fit, residuals: Array) -> tuple[list[Array], list[Array]]:
+    """Residuals of force [N], without clipped samples, and of motion [m/s] or [m], of each impact."""
+    force, motion, begin = list[Array](), list[Array](), 0
     for impact in fit.impacts:
         n = len(impact.time)
         force.append(residuals[begin : begin + n][~impact.clipped] * fit.weights.force)
         motion.append(residuals[begin + n : begin + 2 * n] * fit.weights.motion)
         begin += 2 * n
-    return np.concatenate(force), np.concatenate(motion)
+    return force, motion
 
 
-def _correlation(fit: _Fit, force: Array) -> float:
-    """Correlation of the force's residuals at neighbouring samples."""
-    ends = np.cumsum([np.sum(~impact.clipped) for impact in fit.impacts])[:-1]
-    products = sum(float(r[1:] @ r[:-1]) for r in np.split(force, ends))
-    return products / max(float(force @ force), 1e-300)
+def _correlation(parts: Sequence[Array]) -> float:
+    """Correlation of residuals at neighbouring samples of the same impact."""
+    return sum(float(r[1:] @ r[:-1]) for r in parts) / max(sum(float(r @ r) for r in parts), 1e-300)
 
 
-def _rms(x: Array) -> float:
-    return float(np.sqrt(np.mean(x**2)))
+def _rms(parts: Sequence[Array]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
 def _weights_of_residuals(fit: _Fit, z: Array) -> _Weights:
     """Weights from the residuals of a fit, corrected for its degrees of freedom."""
     force, motion = _parts(fit, fit.residuals(z))
-    n = len(force) + len(motion)
+    n = sum(map(len, force)) + sum(map(len, motion))
     correction = np.sqrt(n / max(n - len(z), 1))
     first = [_first_weights(impact) for impact in fit.impacts]
     min_force = _MIN_NOISE * max(impact.peak for impact in fit.impacts)
@@ -434,7 +432,7 @@ def _law_fit(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
     """Result of a fit; intervals are those of its linearization, by Student's t distribution."""
     residuals, jacobian = fit.residuals(z), fit.jacobian(z)
     force, motion = _parts(fit, residuals)
-    n, m, p = len(force), len(motion), len(z)
+    n, m, p = sum(map(len, force)), sum(map(len, motion)), len(z)
     half_width = _standard_errors(jacobian) * float(stdtrit(max(n + m - p, 1), 0.5 + level / 2))
     estimates = {}
     for each, at, half in zip(fit.free, z, half_width, strict=False):
@@ -449,6 +447,9 @@ def _law_fit(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
         speeds.append(Estimate(at, at - half, at + half, "m/s"))
     parameters = {name: each.value for name, each in estimates.items() if name != MASS}
     peak = max(impact.peak for impact in fit.impacts)
+    largest_motion = max(
+        impact.speed * (impact.duration if impact.travels else 1.0) for impact in fit.impacts
+    )
     # Akaike's criterion, with the variances of force and motion unknown: each sample counts 2 log(rms)
     min_force, min_motion = _MIN_NOISE * peak, fit.weights.motion * 1e-6
     deviance = 2 * n * np.log(max(_rms(force), min_force)) + 2 * m * np.log(max(_rms(motion), min_motion))
@@ -461,7 +462,9 @@ def _law_fit(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
         force_left=_rms(force),
         force_left_pct=100 * _rms(force) / peak,
         motion_left=_rms(motion),
-        correlation=_correlation(fit, force),
+        motion_left_pct=100 * _rms(motion) / largest_motion,
+        correlation=_correlation(force),
+        motion_correlation=_correlation(motion),
         aic=deviance + 2 * p,
     )
 

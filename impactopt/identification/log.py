@@ -308,9 +308,9 @@ def find_impacts(log: ImpactLog) -> tuple[tuple[MeasuredImpact, ...], tuple[floa
             f"{name}: {FORCE} goes down to {log.force.min():.4g} N, and up to {peak:.4g} N only; the "
             "force on the target is positive in contact: turn its sign"
         )
-    # noise is as far below the median as above it, unlike an impact
-    median = float(np.median(log.force))
-    if peak <= 0 or peak - median < max(6 * noise, 2 * (median - float(log.force.min()))):
+    # Noise is as far below zero as above it, unlike an impact. The median is no such level: contact may fill
+    # most of a log.
+    if peak <= 0 or peak < max(6 * noise, -2 * float(log.force.min())):
         raise InputError(f"{name}: no contact: {FORCE} is at most {peak:.4g} N, as large as its noise")
     spans = _spans(log.force, max(_MIN_CONTACT_FORCE * peak, 4.5 * noise))
     spans = [span for span in spans if log.force[slice(*span)].max() > _MIN_PEAK * peak]

@@ -17,7 +17,7 @@ from impactopt.identification.free_parameters import MASS
 _MAX_WIDTH = 1.0  # of the interval of a determined parameter, over its value
 _DIGITS = 5  # of parameters in a file
 _MAX_CORRELATION = 4.0  # of white noise, in standard deviations
-_INTERPOLATION_ERROR = 0.05  # [% of the peak] residual of a log without noise
+_INTERPOLATION_ERROR = 0.05  # [% of the largest force or motion] residual of a log without noise
 _LIGHT = 0.05  # [kg] no robot's effective mass is less
 _LISTED = 5  # times of contacts that are left out
 _TIE = 10.0  # difference of AIC below which a log cannot distinguish laws
@@ -54,8 +54,9 @@ class LawFit:
     force_left [N] : root mean square of the force's residuals
     force_left_pct : the same, in % of the largest force
     motion_left : root mean square of the motion's residuals [m/s], or [m] for joint positions
-    correlation : of the force's residuals at neighbouring samples; about 0 for white noise, closer
-        to 1 the less the law fits
+    motion_left_pct : the same, in % of the largest speed, or of the largest product of speed and contact time
+    correlation, motion_correlation : of the residuals of force and of motion at neighbouring samples; about 0
+        for white noise, closer to 1 the less the law, or the two masses, fit
     aic : Akaike's information criterion, with unknown noise of force and motion; only differences between
         laws are meaningful
     """
@@ -68,7 +69,9 @@ class LawFit:
     force_left: float
     force_left_pct: float
     motion_left: float
+    motion_left_pct: float
     correlation: float
+    motion_correlation: float
     aic: float
 
     def __repr__(self) -> str:
@@ -103,7 +106,9 @@ class LawFit:
             "force_left_N": self.force_left,
             "force_left_pct": self.force_left_pct,
             "motion_left": self.motion_left,
+            "motion_left_pct": self.motion_left_pct,
             "correlation": self.correlation,
+            "motion_correlation": self.motion_correlation,
             "aic": self.aic,
         }
 
@@ -197,16 +202,25 @@ class Identification:
             out.append(
                 f"the log cannot distinguish {best.name} from {', '.join(near)}; impacts at other speeds may"
             )
-        if (
-            best.correlation > _MAX_CORRELATION / np.sqrt(self.samples)
-            and best.force_left_pct > _INTERPOLATION_ERROR
-        ):
-            out.append(
-                f"the residual force of {best.name}, {best.force_left_pct:.2g} % of the peak, is not white "
-                f"noise (correlation of neighbouring samples: {best.correlation:.2f}): another law holds, or "
-                "the log is filtered; intervals are too narrow then"
+        # a fit weighs force and motion by their residuals, so what does not fit may be left in either
+        coloured = [
+            f"the residual {name} of {best.name}, {pct:.2g} % of the {largest}, is not white noise "
+            f"(correlation of neighbouring samples: {correlation:.2f}): {cause}, or the log is filtered; "
+            "intervals are too narrow then"
+            for name, pct, largest, correlation, cause in (
+                ("force", best.force_left_pct, "peak", best.correlation, "another law holds"),
+                (
+                    "motion",
+                    best.motion_left_pct,
+                    "largest",
+                    best.motion_correlation,
+                    "another law holds, the target has another mass, or servos act",
+                ),
             )
-        elif len(self.fits) > 1:
+            if correlation > _MAX_CORRELATION / np.sqrt(self.samples) and pct > _INTERPOLATION_ERROR
+        ]
+        out += coloured
+        if not coloured and len(self.fits) > 1:
             out.append("the best of these laws need not be the true one")
         if best.undetermined:
             out.append(f"the log does not determine {', '.join(best.undetermined)} of {best.name}")

@@ -227,8 +227,8 @@ class CollisionBatch:
         collisions = CollisionResults(
             found=found,
             states=states,
+            robot=model.robot,
             torque_limit=settings["torque_limit"],
-            velocity_limit=model.robot.velocity_limit,
             polygon=posture.polygon,
         )
         for name, measure in self.measures.items():

@@ -209,6 +209,10 @@ def test_a_collision_needs_no_sections_of_plans(file: Path) -> None:
 def test_a_collision_that_there_is_not_exits_1(file: Path) -> None:
     out, _ = run("collide", file, "--speed", 0.5, "--set", "problem.point.0=3", code=1)
     assert "no collision: the point is out of reach" in out
+    soft = ("collide", file, "--speed", 0.5, "--set", "contact.stiffness=1e4", "--json", "-q")
+    found = json.loads(run(*soft, "--horizon", 2e-3, code=1)[0])
+    assert "raise it" in found["reason"] and "--horizon" in found["reason"]
+    assert json.loads(run(*soft, "--horizon", 0.4)[0])["contact_ms"] > 2
     found = json.loads(run("collide", file, "--speed", 50, "--json", "-q", code=1)[0])
     assert "faster than its limit" in found["reason"] and "impulse_Ns" not in found
     assert "give --speed" not in run("collide", file, code=2)[1]

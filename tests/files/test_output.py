@@ -210,6 +210,14 @@ def test_a_damaged_record_is_never_read_as_another(tmp_path: Path) -> None:
         ("strike_posture", np.zeros(3)),
         ("joints", np.zeros(3)),
         ("torque_limit", np.zeros(1)),
+        ("collision_ground", None),
+        ("collision_ground", np.zeros(4)),
+        ("collision_sole_wrench", None),
+        ("collision_sole_wrench", np.zeros((0, 12))),
+        ("simulated_contact_time", None),
+        ("simulated_contact_force", np.zeros(0)),
+        ("sole_left", np.zeros(4)),
+        ("sole_left", np.full((4, 2), np.nan)),
         ("plan_x", np.zeros(2, dtype="S3")),
         ("summary_json", np.array("[" * 100_000)),
         ("summary_json", np.array("[]")),
@@ -225,6 +233,16 @@ def test_an_array_that_is_not_what_it_should_be_is_named(
         arrays = {key: file[key] for key in file.files if key != name}
     np.savez(numbers, **arrays, **({} if value is None else {name: value}))
     with pytest.raises(InputError, match="is damaged"):
+        load_record(tmp_path)
+
+
+def test_a_sole_of_a_stance_phase_without_corners_is_damage(record: Record, tmp_path: Path) -> None:
+    summary = {**record.summary, "stances": [{"soles": ["left", "right"], "from_s": 0.0, "to_s": 1.0}]}
+    save_record(dataclasses.replace(record, summary=summary), tmp_path)
+    assert load_record(tmp_path).summary["stances"] == summary["stances"]
+    arrays = {name: array for name, array in record.arrays.items() if name != "sole_left"}
+    save_record(dataclasses.replace(record, summary=summary, arrays=arrays), tmp_path)
+    with pytest.raises(InputError, match="sole_left is missing"):
         load_record(tmp_path)
 
 

@@ -98,6 +98,19 @@ def test_intervals_of_95_percent_are_such() -> None:
         assert sum(one.low <= value <= one.high for one in each) >= 29, name
 
 
+def test_contact_may_fill_most_of_a_log() -> None:
+    log = log_of(TrueBlow("Kelvin-Voigt", mass=MASS), noise=0.005, seed=1)
+    assert log.speed is not None
+    in_contact = log.force > 0.05 * log.force.max()
+    middle, half = float(log.time[in_contact].mean()), 0.58 * float(np.ptp(log.time[in_contact]))
+    kept = np.abs(log.time - middle) < half
+    assert np.mean(in_contact[kept]) > 0.8
+    near = ImpactLog(time=log.time[kept], force=log.force[kept], speed=log.speed[kept])
+    found = identify(near, laws=["Kelvin-Voigt"]).best
+    for name, value in {**TRUE["Kelvin-Voigt"][1], "effective_mass": MASS}.items():
+        assert found.estimates[name].value == pytest.approx(value, rel=0.05), name
+
+
 def test_several_blows_share_law_and_mass_and_leave_a_free_target() -> None:
     blows = [TrueBlow("Hunt-Crossley", mass=MASS, speed=v, target_mass=2.0) for v in (0.5, 1.0, 1.5)]
     found = identify(log_of(*blows, seed=1), laws=[HuntCrossley], target_mass=2.0).best
@@ -128,6 +141,18 @@ def test_a_force_in_kilonewtons_is_told() -> None:
 def test_a_law_that_does_not_fit_is_told() -> None:
     found = identify(log_of(TrueBlow("Hunt-Crossley")), laws=[SpringDamper])
     assert any("not white noise" in caution for caution in found.cautions)
+
+
+def test_a_motion_that_does_not_fit_is_told() -> None:
+    """A free target taken for a fixed one: the more noise a speed has, the more of that is left in it."""
+    log = log_of(TrueBlow("Kelvin-Voigt", target_mass=6.0), noise=0.01, seed=3)
+    assert log.speed is not None
+    noise = 0.05 * np.random.default_rng(0).normal(size=len(log.time))
+    log = dataclasses.replace(log, speed=log.speed + noise)
+    wrong, right = (identify(log, laws=["Kelvin-Voigt"], target_mass=mass) for mass in (np.inf, 6.0))
+    assert wrong.best.motion_correlation > 0.3 > abs(right.best.motion_correlation)
+    assert any("residual motion of Kelvin-Voigt" in caution for caution in wrong.cautions)
+    assert not any("white noise" in caution for caution in right.cautions)
 
 
 def test_a_law_of_ones_own() -> None:
@@ -242,6 +267,8 @@ def test_logs_that_cannot_be_used_are_refused() -> None:
         ({"force": f[1:]}, "expected shape"),
         ({"force": 0.0 * f}, "no contact"),
         ({"force": np.random.default_rng(0).normal(size=len(f))}, "no contact"),
+        ({"force": f.max() * np.sin(300 * t)}, "no contact"),
+        ({"force": f + 0.1 * f.max()}, "take an offset off"),
         ({"force": -f}, "turn its sign"),
         ({"speed": -v}, "turn its sign"),
         ({"speed": 1e3 * v}, "mm/s"),

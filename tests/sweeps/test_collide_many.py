@@ -233,6 +233,19 @@ def test_scales_of_the_servo_leave_a_soft_grip_as_it_is() -> None:
     assert abs(alone["impulse_Ns"][0] / as_it_is["impulse_Ns"][0] - 1) > 1e-3
 
 
+def test_a_robot_of_little_weight_has_a_zmp_too() -> None:
+    """At rest it is below the centre of mass, whatever the robot weighs: here 0.6 N."""
+    given = {"posture": "half_sitting", "speed_m_s": 1e-6}
+    margins = []
+    for gravity in (9.81, 0.01):
+        section = {"preset": "standin", "gravity_m_s2": [0.0, 0.0, -gravity]}
+        data = {**standin_file().data, "robot": section}
+        data["problem"] = {key: x for key, x in data["problem"].items() if key != "robot"}
+        file = problem_file_from_data(data, where="light.toml")
+        margins.append(collide_many(file, {}, at_contact=given, outputs=("zmp_margin_m",))["zmp_margin_m"][0])
+    assert margins[1] == pytest.approx(margins[0], abs=1e-3)
+
+
 BOTH, LEFT, RIGHT = ({"soles": soles} for soles in (["left", "right"], ["left"], ["right"]))
 
 

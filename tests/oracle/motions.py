@@ -31,7 +31,7 @@ End = str | Callable[["Variables"], NDArray[np.float64]]  # rest, free, coasting
 NONE = np.zeros(0)
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
-FREE_BOX = np.array([10.0, 10.0, 10.0, 3.0, 1.2, 3.0])  # the same of one that nothing holds
+FREE_BOX = np.array([np.inf, np.inf, np.inf, 3.0, 1.2, 3.0])  # the same of one that nothing holds
 REST, FREE, COASTING = "rest", "free", "coasting"  # how a spline may begin or end
 
 

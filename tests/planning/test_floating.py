@@ -22,6 +22,7 @@ from impactopt import (
     Robot,
     Scenario,
     SelfCollision,
+    Slide,
     Solution,
     SpringDamper,
     Status,
@@ -201,6 +202,25 @@ def test_a_robot_in_flight_falls_to_the_target() -> None:
     assert solution.impulse == pytest.approx(hardest(), rel=2e-3)
     for engine in ("pinocchio", "mujoco"):
         assert solution.validate(engine=engine).impulse == pytest.approx(solution.impulse, rel=1e-2)
+
+
+def test_a_long_fall_is_planned() -> None:
+    """In the default time of swing and follow-through it is 16 m long, and changes nothing in the impact."""
+    swing, follow = 0.8, 1.0
+    problem = pushing(
+        two_bodies([0.0, 0.0, -GRAVITY]),
+        point=np.array([0.45, 0.0, -GRAVITY * swing**2 / 2]),
+        swing=Phase(duration=swing),
+        follow=Phase(duration=follow),
+        # the striker falls past the target at 8 m/s
+        terms=(*TERMS, Incidence(speed=np.inf), Slide(enabled=False)),
+    )
+    solution = solve(problem, refine=False)
+    assert solution.status is Status.SOLVED, solution.result.message
+    assert solution.impulse == pytest.approx(hardest(), rel=2e-3)
+    reference = solution.plan.reference
+    assert reference.q[:, 2] == pytest.approx(-GRAVITY * reference.time**2 / 2, abs=1e-3)
+    assert reference.q[reference.phase == 2, 2].min() < -15
 
 
 def test_what_it_is_not_for(thrown: Solution) -> None:

@@ -313,6 +313,11 @@ class Robot:
         return tuple(build.moving_joints(self.model))
 
     @cached_property
+    def prismatic(self) -> NDArray[np.bool_]:
+        """(n,) True for prismatic joints."""
+        return np.array(["JointModelP" in joint.shortname() for joint in self.joint_models])
+
+    @cached_property
     def angles(self) -> JointAngles:
         """Angles of its joints in configurations."""
         return JointAngles(self.joint_models)

@@ -212,15 +212,13 @@ class Export:
         )
 
     def _joints(self) -> list[dict[str, Any]]:
-        robot, models = self.robot, self.robot.joint_models
-        out = []
+        robot, out = self.robot, []
         for name, k in zip(self.joints, self.order, strict=True):
-            prismatic = "JointModelP" in models[k].shortname()
             out.append(
                 {
                     "name": name,
                     **({"passive": True} if robot.passive[k] else {}),
-                    "kind": "prismatic" if prismatic else "revolute",
+                    "kind": "prismatic" if robot.prismatic[k] else "revolute",
                     "kp": robot.kp[k],
                     "kd": robot.kd[k],
                     "effort_limit": robot.torque_limit[k],

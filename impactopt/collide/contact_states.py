@@ -9,7 +9,7 @@ A case's posture is one of a few, each found once, with changes of some joint an
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -146,6 +146,9 @@ _REFERENCE_TIME, _DEFAULT_REFERENCE_TIME = 2.1, 0.1
 _VELOCITY_ERROR = 1e-6  # [m/s] permitted of the striking point, at 1 m/s
 
 
+NOT_APPROACHING = "the target moves away at least as fast as the striking point"
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posture:
     """Posture q (nq,) that the joint angles of cases are relative to.
@@ -187,6 +190,11 @@ class States:
         if self.reference is None or self.reference_until is None:
             return {}
         return {"reference": self.reference, "reference_until": self.reference_until}
+
+    def approaching(self, before: Any) -> States:
+        """States with the reason of those in which no contact begins; before : the target's speed [m/s]."""
+        flees = (self.reason == "") & (self.speed <= before)
+        return replace(self, reason=np.where(flees, NOT_APPROACHING, self.reason))
 
     def some(self, cases: NDArray[np.intp]) -> States:
         """States of the cases with these indices."""

@@ -356,6 +356,7 @@ def collide_once(
     joints = {name: np.array([angle]) for name, angle in section.joints.items()}
     normal = np.asarray(model.normal)
     state = states.compute(posture, joints, speed, normal, 1, velocity=section.velocity)
+    state = state.approaching(model.target.speed_before())
     if state.reason[0]:
         return {**head, "reason": str(state.reason[0])}
     collision = _collide(model, state, section)

@@ -138,6 +138,7 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
     robot, c = problem.robot, problem.coordinates
     out: dict[str, Any] = {
         "joints": np.array(robot.joint_names),
+        "prismatic": robot.prismatic,
         "torque_limit": robot.torque_limit,
         "velocity_limit": robot.velocity_limit,
         "armature": robot.armature,

@@ -35,15 +35,15 @@ class Record:
 
     summary : the content of `summary.json`.
     problem : text of the problem file, "" if there was none.
-    arrays : by name. `joints`, `torque_limit`, `velocity_limit`, `armature` (n,); `polygon` and `sole_<name>`
-        (k, 2) [m], corners on the ground, for a sole that steps in its first foothold; `reference_angle`,
-        `simulated_angle` (k, n), joint angles over time; and, field by field, `reference_*`
-        (`impactopt.transcription.plan.Trajectory`) and, of a plan with an abort motion, `missed_*`,
-        `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*` (`PlannedCollision`),
-        `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation` on free soles, without
-        velocities and torques), `solver_*` (`SolverResult`), `history_*` (its iterations);
-        `program_statement`, names of the program's variables and constraints, as JSON. Histories of many
-        channels are rounded (`rounded`).
+    arrays : by name. `joints`, `prismatic`, `torque_limit`, `velocity_limit`, `armature` (n,); `polygon` and
+        `sole_<name>` (k, 2) [m], corners on the ground, for a sole that steps in its first foothold;
+        `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field by field,
+        `reference_*` (`impactopt.transcription.plan.Trajectory`) and, of a plan with an abort motion,
+        `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*`
+        (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation` on
+        free soles, without velocities and torques), `solver_*` (`SolverResult`), `history_*` (its
+        iterations); `program_statement`, names of the program's variables and constraints, as JSON.
+        Histories of many channels are rounded (`rounded`).
     problem_path : path of the problem file, to which paths in it are relative; None if there was none.
     """
 
@@ -57,6 +57,11 @@ class Record:
         name, impulse = self.summary.get("problem", {}).get("name", ""), self.summary.get("impulse_Ns")
         figure = "" if impulse is None else f", {impulse:.2f} N s"
         return f"<Record of {name!r}: {self.summary.get('status')}{figure}>"
+
+    @property
+    def slides(self) -> bool:
+        """True if the robot has prismatic joints."""
+        return bool(self.arrays.get("prismatic", np.zeros(1)).any())
 
     @property
     def completed(self) -> bool:

@@ -36,7 +36,7 @@ _HISTORIES = {
 _SCHEMA: Mapping[str, Mapping[str, str]] = {
     "": {
         **{"joints": "n", "torque_limit": "n", "velocity_limit": "n", "polygon": "c 2"},
-        "armature": "? n",
+        **dict.fromkeys(("armature", "prismatic"), "? n"),
     },
     "reference": {**_REFERENCE, "angle": "k n"},
     "missed": _REFERENCE,

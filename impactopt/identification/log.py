@@ -17,7 +17,6 @@ from scipy.integrate import trapezoid
 from impactopt.codegen.files import read_archive
 from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, shortened
 from impactopt.kinematics.operational_space import ConstrainedDynamics
-from impactopt.robots.couplings import axis_of
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -209,21 +208,17 @@ def _hand(
 
 def _joint(columns: Columns, robot: Robot, k: int, name: str) -> Array:
     """Positions (k,) [rad] or [m] of a joint, by its number."""
-    joint, slides = robot.joint_names[k], not _turns(robot, k)
-    values = _column(columns, f"{joint}_{'m' if slides else 'rad'}", name)
+    joint = robot.joint_names[k]
+    values = _column(columns, f"{joint}_{'m' if robot.prismatic[k] else 'rad'}", name)
     low, high = robot.lower[k], robot.upper[k]
     values = check_array(f"{name}: {joint}", values, (np.size(_column(columns, TIME, name)),), most=MOST)
     far = np.maximum(values - high, low - values).max(initial=0.0)
-    if not slides and far > _MAX_BEYOND:
+    if not robot.prismatic[k] and far > _MAX_BEYOND:
         raise InputError(
             f"{name}: {joint} is {far:.3g} rad outside its limits, {low:.3g} to {high:.3g} rad; are these "
             "degrees? Multiply them by pi / 180"
         )
     return values
-
-
-def _turns(robot: Robot, k: int) -> bool:
-    return bool(axis_of(robot.model, robot.joint_models[k].id).subspace[3:].any())
 
 
 _MIN_CONTACT_FORCE, _MIN_PEAK = 0.1, 0.2  # of contact, and of an impact's peak, over the log's largest force

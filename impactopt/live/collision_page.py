@@ -52,8 +52,8 @@ class CollisionPage(LivePage):
 
     Attributes
     ----------
-    address : of the page.  shown : the latest collision.  joints : sliders [rad] by name.  speed : slider of
-    the striker's speed [m/s].
+    address : of the page.  shown : the latest collision.  joints : sliders [rad], [m] by name.  speed :
+    slider of the striker's speed [m/s].
 
     Raises
     ------
@@ -104,19 +104,19 @@ class CollisionPage(LivePage):
         step = (_MAX_SPEED - _MIN_SPEED) / _SLIDER_STEPS
         self.speed = gui.add_slider("speed [m/s]", _MIN_SPEED, _MAX_SPEED, step, _FIRST_SPEED)
         self.joints: dict[str, Any] = {}
-        with gui.add_folder("Posture [rad]"):
+        with gui.add_folder("Posture"):
             lower, upper = drawn_ranges(robot)
             for k, joint in enumerate(c.independent):
                 low, high = lower[joint], upper[joint]
                 value = float(np.clip(self._y[c.base + k], low, high))
                 step = float(high - low) / _SLIDER_STEPS
-                name = robot.joint_names[joint]
-                self.joints[name] = gui.add_slider(name, float(low), float(high), step, value)
+                name, unit = robot.joint_names[joint], "m" if robot.prismatic[joint] else "rad"
+                self.joints[name] = gui.add_slider(f"{name} [{unit}]", float(low), float(high), step, value)
         for slider in (self.speed, *self.joints.values()):
             slider.on_update(lambda _: self.changed())
 
     def _collide(self, request: Array, stale: Callable[[], bool]) -> ShownCollision:
-        """Collision for a request: speed [m/s], and the sliders' angles [rad]."""
+        """Collision for a request: speed [m/s], and the sliders' angles [rad] and travels [m]."""
         began = time.perf_counter()
         p, c = self.problem, self.problem.coordinates
         speed, y = float(request[0]), self._y.copy()

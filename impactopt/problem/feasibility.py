@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from impactopt.bodies.clearance import Places, Touch
+from impactopt.contact.targets import Nail
 from impactopt.errors import InputError
 from impactopt.kinematics.inverse_kinematics import Reach, inverse_kinematics, reach
 from impactopt.kinematics.operational_space import striking_point
@@ -33,6 +34,8 @@ _ROUNDING = 1e-6  # of a torque limit, by the linear program
 PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers in a problem file
 LONG = 10.0  # [s] of a phase: longer ones are hard to believe
 HEAVY = 20.0  # mass of a target over the robot's, likewise
+HEAVY_NAIL = 1.0  # [kg]: a heavier one is hard to believe
+SOFT_WOOD = 1.0  # [N]: a smaller resistance is hard to believe
 DRAWN_POSTURES = 3  # initial guesses of inverse kinematics, beside the postures at start and at contact
 # initial guesses of random postures at the hit point, and postures found from which it may count as blocked
 DRAWN_AT_HIT, LEAST_AT_HIT = 24, 4
@@ -107,7 +110,7 @@ def sticks_out(problem: ImpactProblem) -> list[str]:
 
 
 def unusual(problem: ImpactProblem) -> list[str]:
-    """Messages about durations and masses that look as if they were in another unit."""
+    """Messages about numbers that look as if they were in another unit."""
     phases = {"swing": problem.swing, "follow": problem.follow}
     found = [
         f"[{name}] duration_s is at least {phase.duration[0]:g}: an impact's motion takes about a second; is "
@@ -120,6 +123,10 @@ def unusual(problem: ImpactProblem) -> list[str]:
         found.append(
             f"[target] mass_kg: {mass:g} kg is {mass / robot:.0f} times the robot's mass; is it in grams?"
         )
+    elif isinstance(problem.target, Nail) and mass > HEAVY_NAIL:
+        found.append(f"[target] mass_kg: {mass:g} kg is much for a nail; is it in grams?")
+    if isinstance(problem.target, Nail) and problem.target.resistance < SOFT_WOOD:
+        found.append(f"[target] resistance_N: {problem.target.resistance:g} N is no wood's; is it in kN?")
     return found
 
 

@@ -79,8 +79,9 @@ class _Charts:
         if self.legged:
             yield self._zmp_path()
         yield self._torque_ratio()
-        yield self._joint("torque", "torque [N m]")
-        yield self._joint("angle", "angle [rad]")
+        slides = self.record.slides
+        yield self._joint("torque", "torque or force [N m or N]" if slides else "torque [N m]")
+        yield self._joint("angle", "angle or travel [rad or m]" if slides else "angle [rad]")
         yield from self._soles()
 
     def _chart(self, title: str, unit: str, series: list[dict[str, Any]], **more: Any) -> dict[str, Any]:

@@ -209,13 +209,16 @@ class CollisionBatch:
             speed = np.full(count, section.speed)
         normal = np.asarray(model.normal)
         states = self.states.compute(posture, joints, speed, normal, count, velocity=section.velocity)
+        settings, target = self._settings(numbers), model.target
+        own = {name: settings.get(f"target_{name}", value) for name, value in target.parameters.items()}
+        states = states.approaching(target.speed_before(own))
         out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.measures}
         out["reason"] = states.reason
         good = np.flatnonzero(states.reason == "")
         if not good.size:
             return out
         states = states.some(good)
-        settings = {name: x[good] if len(x) == count else x for name, x in self._settings(numbers).items()}
+        settings = {name: x[good] if len(x) == count else x for name, x in settings.items()}
         settings |= states.reference_settings
         # a point mass has no servo, and the paper's SDC no stiffness
         known = getattr(model, "settings", settings)

@@ -7,8 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.small_robots import slider
 
-from impactopt import SDC, InputError, holding_torque, load_problem, striking_velocity
+from impactopt import (
+    SDC,
+    FixedBase,
+    FreeMass,
+    ImpactProblem,
+    InputError,
+    SpringDamper,
+    holding_torque,
+    load_problem,
+    striking_velocity,
+)
 from impactopt.live.collision_page import CollisionPage
 
 FILE = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
@@ -63,3 +74,20 @@ def test_where_there_is_no_collision_the_page_says_why(
     assert look.wait(LONG)
     assert look.shown.collision is None
     assert look.text.content == "**No collision.** the hand cannot move along the normal"
+
+
+def test_a_slider_has_the_unit_of_its_joint(look: CollisionPage) -> None:
+    """A rail's was an angle in radians."""
+    assert [joint.label for joint in look.joints.values()] == [f"{name} [rad]" for name in look.joints]
+    problem = ImpactProblem(
+        robot=slider(5.0, postures={"start": {"rail": 0.0}}),
+        striker="tip",
+        start="start",
+        stance=FixedBase(),
+        point=[0.25, 0.0, 0.0],
+        normal=[1.0, 0.0, 0.0],
+        target=FreeMass(mass=1.0),
+        law=SpringDamper(stiffness=2e4, damping=50.0),
+    )
+    with CollisionPage(problem) as page:
+        assert page.joints["rail"].label == "rail [m]"

@@ -121,6 +121,10 @@ def test_numbers_that_look_like_another_unit_are_doubted() -> None:
     assert said.startswith("[swing] duration_s") and "milliseconds" in said
     (said,) = unusual(dataclasses.replace(problem, target=heavy))
     assert said.startswith("[target] mass_kg: 3000 kg") and "grams" in said
+    nail = dataclasses.replace(problem.target, mass=50.0, resistance=0.6)
+    heavy_nail, soft = unusual(dataclasses.replace(problem, target=nail))
+    assert heavy_nail.startswith("[target] mass_kg: 50 kg") and "grams" in heavy_nail
+    assert soft.startswith("[target] resistance_N: 0.6 N") and "kN" in soft
 
 
 def test_joints_without_rotors_are_named() -> None:

@@ -471,6 +471,11 @@ def test_charts_hold_the_records_numbers(record: Record) -> None:
             assert {s[key] for key in ("x", "y", "xy", "time") if key in s} <= set(arrays)
     joints = next(chart["joints"] for chart in charts if "joints" in chart)
     assert joints == list(record.arrays["joints"]), "by the names that a file takes"
+    assert not record.arrays["prismatic"].any() and by_title["One joint's angle"]["y"] == "angle [rad]"
+    prismatic = np.arange(len(joints)) == 0
+    rail = dataclasses.replace(record, arrays={**record.arrays, "prismatic": prismatic})
+    units = {chart["title"]: chart["y"] for chart in charts_of(rail)[0] if "joints" in chart}
+    assert all("[N m or N]" in y or "[rad or m]" in y for y in units.values()), "a prismatic joint's, too"
 
 
 def test_the_planned_hand_is_as_fast_as_the_plan_says(biped_plan: Any) -> None:

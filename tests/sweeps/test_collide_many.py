@@ -394,6 +394,12 @@ def test_what_is_impossible_says_why() -> None:
     assert found["reason"][1] == "elbow would be beyond its limit"
     assert "faster than its limit" in found["reason"][2]
     assert np.isnan(found["impulse_Ns"]).tolist() == [False, True, True]
+    columns, slow = {"target.initial_velocity": [-1.0, 0.3, 0.5]}, {"posture": "ready", "speed_m_s": 0.4}
+    found = collide_many(arm_file(), columns, at_contact=slow)
+    fled = "the target moves away at least as fast as the striking point"
+    assert found["reason"].tolist() == ["", "", fled], "it was an impulse of zero"
+    assert np.isnan(found["impulse_Ns"]).tolist() == [False, False, True]
+    assert collide_once(arm_file().changed({"target.initial_velocity": 0.5}), slow)["reason"] == fled
     short = {"posture": "ready", "speed_m_s": 1.0, "horizon_s": 2e-3}
     found = collide_many(arm_file(), {"target.mass": [0.5, 0.001]}, at_contact=short)
     assert "not ended" in found["reason"][0] and found["reason"][1] == ""

@@ -39,7 +39,8 @@ def motion(figure: FigureBase, record: Record) -> None:
             top.plot(a["simulated_time"], a["simulated_angle"][:, j], ":", color=BLACK, linewidth=1.2)
     for axes in (top, bottom):
         axes.axvspan(a["reference_contact_start"], a["reference_contact_end"], color="#bbbbbb", zorder=0)
-    top.set(ylabel="angle [rad]", title=title(record, "joints that move most"), xlim=(0.0, until))
+    label = "angle or travel [rad or m]" if record.slides else "angle [rad]"
+    top.set(ylabel=label, title=title(record, "joints that move most"), xlim=(0.0, until))
     bottom.set(xlabel="time [s]", ylabel="planned velocity / limit")
     handles, labels = top.get_legend_handles_labels()
     if record.simulated:

@@ -318,11 +318,6 @@ class Robot:
         return build.prismatic(self.model)
 
     @cached_property
-    def prismatic(self) -> NDArray[np.bool_]:
-        """(n,) True for prismatic joints."""
-        return np.array(["JointModelP" in joint.shortname() for joint in self.joint_models])
-
-    @cached_property
     def angles(self) -> JointAngles:
         """Angles of its joints in configurations."""
         return JointAngles(self.joint_models)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.contact.fields import snake_case
-from impactopt.contact.laws import ContactLaw
 from impactopt.errors import InputError
 from impactopt.planning.bounds import (
     FEASIBLE,
@@ -31,7 +30,7 @@ from impactopt.planning.bounds import (
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import Margins, deepest_penetration
 from impactopt.planning.lazy_constraints import with_lazy_constraints
-from impactopt.planning.parameter_changes import changed
+from impactopt.planning.parameter_changes import changed, with_parameter
 from impactopt.planning.refinement import program_for
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import LONGEST, SHORTEST, Phase
@@ -191,7 +190,7 @@ class _CauseSearch:
         for factor in () if known is None else _STIFFNESS_FACTORS:
             # Two digits are what the message gives, so it is what is tried.
             value = float(f"{known * factor:.2g}")
-            law: ContactLaw = replace(p.law, stiffness=value)  # type: ignore[type-var]
+            law = with_parameter(p.law, "stiffness", value)
             new = changed_or_none(p, law=law)
             if new is None:
                 continue

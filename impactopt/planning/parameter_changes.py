@@ -70,11 +70,11 @@ def moved_problem(
         if vector is not None:
             new[name] = np.array(vector, dtype=float)
     if mass is not None:
-        new["target"] = _with(problem.target, "mass", mass)
+        new["target"] = with_parameter(problem.target, "mass", mass)
     law = problem.law
     for name, value in (("stiffness", stiffness), ("damping", damping)):
         if value is not None:
-            law = new["law"] = _with(law, name, value)
+            law = new["law"] = with_parameter(law, name, value)
     if margin is not None:
         cone = problem.term(ContactWrenchCone)
         both = {"margin": margin} | ({} if cone.collision_margin is None else {"collision_margin": margin})
@@ -87,10 +87,12 @@ def moved_problem(
 MOVABLE = tuple(inspect.signature(moved_problem).parameters)[1:]
 
 
-def _with(thing: Any, name: str, value: float) -> Any:
-    known = [field.name for field in dataclasses.fields(thing)]
-    check_choice(f"{type(thing).__name__} has no parameter", name, known)
-    return dataclasses.replace(thing, **{name: value})
+def with_parameter(thing: Any, name: str, value: float) -> Any:
+    """Law or target with another value of a parameter; InputError if it has no such parameter."""
+    # not by dataclasses.replace: a CustomLaw is no dataclass
+    numbers = thing.parameters
+    check_choice(f"{type(thing).__name__} has no parameter", name, numbers)
+    return type(thing)(**{**numbers, name: value})
 
 
 def with_term(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
@@ -127,7 +129,7 @@ class Parameter:
             term = dataclasses.replace(self.problem.term(kind), **{name: value})
             return changed(self.problem, terms=with_term(self.problem, term))
         part = getattr(self.problem, self._field)
-        return changed(self.problem, **{self._field: _with(part, self._part, value)})
+        return changed(self.problem, **{self._field: with_parameter(part, self._part, value)})
 
 
 def parameter_of(problem: ImpactProblem, name: str) -> Parameter:

@@ -14,6 +14,7 @@ import pytest
 from support.small_plans import BODILESS, arm_problem
 
 from impactopt import (
+    CustomLaw,
     GearLoad,
     HitRegion,
     Impulse,
@@ -187,6 +188,17 @@ class _OwnTerm(Slide):
     def add_constraints(self, program: Any) -> None:
         place = float(program.problem.point[2])
         program.constraints.add(term="own", components=["x"], affine=program.swing_T[0], lower=place - 10.0)
+
+
+def test_parameters_of_a_law_from_a_formula_change(arm: Solution) -> None:
+    """They ended in a TypeError, as a CustomLaw is no dataclass."""
+    law = CustomLaw(compression=lambda x, rate, stiffness, h: stiffness * x + h * x**3, stiffness=5e5, h=1e9)
+    problem = replace(arm.problem, law=law)
+    softer = moved_problem(problem, stiffness=2e5).law
+    assert softer.parameters == {"stiffness": 2e5, "h": 1e9} and softer.force(1e-3, 0.0) == 201.0
+    assert parameter_of(problem, "contact.h").at(2e9).law.parameters == {"stiffness": 5e5, "h": 2e9}
+    with pytest.raises(InputError, match="CustomLaw has no parameter 'damping'"):
+        moved_problem(problem, damping=1.0)
 
 
 def test_a_program_that_does_not_follow_is_built_anew(arm: Solution) -> None:

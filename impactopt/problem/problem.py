@@ -252,6 +252,12 @@ class ImpactProblem:
         if self.scenarios and not self.lasts:
             raise InputError(f'scenarios need a contact that lasts, as "full", not {self.collision!r}')
         check_apart("scenario", [s.name for s in self.scenarios])
+        aborts = sorted({s.abort_after for s in self.scenarios if s.abort_after is not None})
+        if len(aborts) > 1:
+            raise InputError(
+                f"scenarios give abort_after of {' and '.join(f'{each:g}' for each in aborts)} s, and a plan "
+                "has one abort motion: give one of them"
+            )
         if self.floats and self.abort_after is not None:
             raise InputError(
                 f"robot {self.robot.name!r} floats freely, and has no abort motion: leave abort_after out of "

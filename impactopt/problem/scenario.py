@@ -144,7 +144,8 @@ class Scenario(Described):
     wrench cones) and on the balance after it hold too, with their own margins, under the same reference and
     servo. If the target is missing, no impulse slows the robot down, and balance is required at contact. With
     `abort_after` an abort motion follows, which brings the robot to rest and is planned with the swing;
-    without it, the follow-through.
+    without it, the follow-through. A plan has one abort motion, so all scenarios that give `abort_after` have
+    the same.
     """
 
     name: str = field(metadata=about("what reports call it"))

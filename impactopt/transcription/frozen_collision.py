@@ -236,9 +236,9 @@ class FrozenCollision(Collision):
         self._frozen = [self._freeze(k) for k in range(max(self.freezes, 1))]
 
     def _add_reference(self, count: int) -> None:
-        """Add variables of the reference: first at the beginnings of segments, then at their freezes."""
+        """Add variables of the reference, at `_instants`."""
         # without freezes the only segment begins at contact, where the freeze is, too
-        count, labels = max(2 * self.freezes, 1), self._b.coordinates.leg_labels
+        count, labels = max(2 * self.freezes, 1) + 1, self._b.coordinates.leg_labels
         super()._add_reference(count)
         name = f"{self._prefix}coasting leg accelerations"
         self.coast_accelerations = self._b.layout.add(name, count, self._b.nl, labels=labels)
@@ -285,11 +285,14 @@ class FrozenCollision(Collision):
         )
 
     def _instants(self) -> list[tuple[int, float]]:
-        """Phase and place of each instant of the reference's variables: beginnings of segments, freezes."""
+        """Phase and place of each instant of the reference's variables: beginnings of segments, freezes, and
+        the end of contact, which `ReferenceRange` bounds.
+        """
         # a segment begins where the stage before its first one is
         firsts = [self.stages[self._segments.index(k)].previous for k in range(len(self._frozen))]
         begins = [(0, 0.0) if i < 0 else (self.stages[i].phase, self.stages[i].place) for i in firsts]
-        return [*begins, *((at.phase, at.place) for at in self._frozen[: self.freezes])]
+        freezes = [(at.phase, at.place) for at in self._frozen[: self.freezes]]
+        return [*begins, *freezes, (len(self.phases) - 1, 1.0)]
 
     def _travel_to(self, k: int) -> list[Affine]:
         """Slots of the block ``moved`` at the freeze in the middle of segment k."""
@@ -485,7 +488,7 @@ class FrozenCollision(Collision):
         b, part = self._b, self._b.parts("coasting")
         closure = [f"{leg.end} {d}" for leg in b.coordinates.legs for d in DIRECTIONS]
         for k in range(self.coast_legs.count):
-            term, place = "legs of the coasting reference", f"freeze {k}{self.suffix}"
+            term, place = "legs of the coasting reference", f"instant {k}{self.suffix}"
             outputs = start + k * size
             b.equal(term, place, closure, outputs + part["closure"], along(closure, "off"))
             labels = self.coast_rates.labels

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.small_plans import Planned, arm_problem
+from support.small_plans import BODILESS, Planned, arm_problem, biped_problem, transcribed
 
 from impactopt import GearLoad, ReferenceRange, load_problem, solve
 from impactopt.planning import lazy_constraints
 from impactopt.planning.lazy_constraints import reference_beyond
 from impactopt.problem import problem as problems
 from impactopt.transcription import mesh
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import NO_MORE, nodes_to_add
 
 
@@ -29,6 +30,23 @@ def test_a_reference_that_goes_too_far_gets_rows(monkeypatch: pytest.MonkeyPatch
     free = solve(replace(arm_problem(), terms=(*arm_problem().terms, off)))
     assert free.summary()["rows_on_demand"] == []
     assert "reference of shoulder coasts 0.005 rad beyond" in reference_beyond(narrow, free.plan)
+
+
+@pytest.mark.parametrize(("collision", "freezes"), [("full", 0), ("sdc", 0), ("sdc", 2)])
+def test_legs_are_bounded_where_the_reference_is_as_contact_ends(collision: str, freezes: int) -> None:
+    """By the inverse kinematics of a base that coasts down, whose knees bend."""
+    problem = replace(biped_problem(), collision=collision, freezes=freezes)
+    t = transcribed(replace(problem, terms=(*BODILESS, ReferenceRange())))
+    x, c, hit = first_iterate(t), t.coordinates, t.expected
+    y, legs, rates = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x), t.u0.read(x)[0].copy()
+    rates[2] -= 1.0
+    t.u0.write(x, rates)
+    hit.guess_model(x, y, rates, legs)
+    end = c.solve_legs(y + rates * sum(hit.durations(x)), legs)
+    origins, values = t.constraints.origins, t.program.constraints(x)
+    place = {each.component: k for k, each in enumerate(origins) if each.term == ReferenceRange.name}
+    assert np.abs(end - legs).max() > 0.2
+    assert values[[place[label] for label in c.leg_labels]] == pytest.approx(end, abs=1e-4)
 
 
 def test_a_leg_that_leaves_its_range_between_nodes_gets_nodes_there(

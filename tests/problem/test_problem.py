@@ -222,6 +222,14 @@ def test_a_normal_along_which_no_joint_moves_is_refused() -> None:
         ({"collision": "virtual-mass", "law": Spring(rate=1e4)}, "SpringDamper only, not Spring"),
         ({"collision": "rigid", "scenarios": (Scenario(name="a"),)}, "scenarios need.*full.*not 'rigid'"),
         ({"scenarios": (Scenario(name="a"), Scenario(name="a", mass=2.0))}, "two scenarios are called 'a'"),
+        (
+            {
+                "scenarios": tuple(
+                    Scenario(name=str(time), missing=True, abort_after=time) for time in (0.1, 0.02)
+                )
+            },
+            r"abort_after of 0\.02 and 0\.1 s, and a plan has one abort motion",
+        ),
         ({"scenarios": Scenario(name="a")}, r"a tuple of Scenario, not Scenario\("),
         ({"scenarios": ("heavy",)}, r"a tuple of Scenario, not \('heavy',\)"),
         (

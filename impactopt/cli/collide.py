@@ -54,6 +54,12 @@ def collide(
             help="Warn if the estimated error of freezing is above this percentage of the impulse.",
         ),
     ] = 1.0,
+    horizon: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S", help="Longest contact (default: 0.2; more for a result whose contact is longer)."
+        ),
+    ] = None,
     settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -88,6 +94,7 @@ def collide(
         if freezes is None and saved and model == "sdc":
             freezes = RESULT_FREEZES
         given = {"model": model, "freezes": freezes, "posture": posture, "speed_m_s": speed}
+        given["horizon_s"] = horizon
         given["result"] = str(what.resolve()) if saved else None
         at_contact = {key: value for key, value in given.items() if value is not None}
         with SolveConsole(console, quiet=quiet) as progress:

@@ -33,7 +33,10 @@ from impactopt.solvers.program import Status
 
 Array = NDArray[np.float64]
 
-NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
+NOT_ENDED = (
+    "the contact has not ended at the horizon; raise it: at_contact.horizon_s, or --horizon of `impactopt "
+    "collide`"
+)
 _FULL_DYNAMICS_STEP = 1e-4  # [s] between instants of its histories
 _IMPULSE_TOLERANCE = 1e-4  # relative, of the full dynamics
 

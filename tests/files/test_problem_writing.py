@@ -156,10 +156,10 @@ OBJECTIVES = st.lists(
 
 
 def _undefined_energy(changes: dict[str, Any]) -> bool:
-    """True of the energy of a damped board, which is refused."""
-    target = changes.get("target")
+    """True of the energy of a damped board, which is refused; it is the problem's own objective."""
+    target, drawn = changes.get("target"), changes.get("objectives", (objectives.TargetEnergy(),))
     damped = isinstance(target, impactopt.Board) and target.damping > 0
-    return damped and any(type(one) is objectives.TargetEnergy for one in changes.get("objectives", ()))
+    return damped and any(type(one) is objectives.TargetEnergy for one in drawn)
 
 
 LETTERS = st.characters(exclude_categories=["Cc", "Cs"], include_characters="\n\t")

@@ -26,6 +26,8 @@ from typing import Any
 import numpy as np
 
 from impactopt.collision.graph import target_start
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import ReferenceRange
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -179,6 +181,12 @@ class _Freeze:
     legs: Affine
 
 
+def bounds_reference(problem: ImpactProblem) -> bool:
+    """True if `ReferenceRange` is among the problem's own terms, and bounds the coasting reference."""
+    term = problem.extra(ReferenceRange)
+    return term is not None and term.active
+
+
 class FrozenCollision(Collision):
     """Variables and constraints of the collision with one target, with frozen dynamics.
 
@@ -237,8 +245,9 @@ class FrozenCollision(Collision):
 
     def _add_reference(self, count: int) -> None:
         """Add variables of the reference, at `_instants`."""
+        self._with_end = self.scenario is None and bounds_reference(self._b.problem)
         # without freezes the only segment begins at contact, where the freeze is, too
-        count, labels = max(2 * self.freezes, 1) + 1, self._b.coordinates.leg_labels
+        count, labels = max(2 * self.freezes, 1) + self._with_end, self._b.coordinates.leg_labels
         super()._add_reference(count)
         name = f"{self._prefix}coasting leg accelerations"
         self.coast_accelerations = self._b.layout.add(name, count, self._b.nl, labels=labels)
@@ -286,13 +295,13 @@ class FrozenCollision(Collision):
 
     def _instants(self) -> list[tuple[int, float]]:
         """Phase and place of each instant of the reference's variables: beginnings of segments, freezes, and
-        the end of contact, which `ReferenceRange` bounds.
+        the end of contact if the reference is bounded there.
         """
         # a segment begins where the stage before its first one is
         firsts = [self.stages[self._segments.index(k)].previous for k in range(len(self._frozen))]
         begins = [(0, 0.0) if i < 0 else (self.stages[i].phase, self.stages[i].place) for i in firsts]
         freezes = [(at.phase, at.place) for at in self._frozen[: self.freezes]]
-        return [*begins, *freezes, (len(self.phases) - 1, 1.0)]
+        return [*begins, *freezes, *([(len(self.phases) - 1, 1.0)] if self._with_end else [])]
 
     def _travel_to(self, k: int) -> list[Affine]:
         """Slots of the block ``moved`` at the freeze in the middle of segment k."""

@@ -22,6 +22,7 @@ from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves, speed_with_order
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import map_stages, same_places
+from impactopt.transcription.frozen_collision import bounds_reference
 from impactopt.transcription.layout import Array, ConstraintOrigin, Group
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.motion_phase import MotionPhase
@@ -328,9 +329,10 @@ def _map_by_label(group: Group, known: Group, *vectors: tuple[Array, Array]) -> 
             new[group.index(k)[entries]] = old[known.index(k)[known_entries]]
 
 
-def _model(t: ContactProgram) -> tuple[str, int]:
-    """Collision model and number of freezes."""
-    return t.problem.collision, t.problem.freezes
+def _model(t: ContactProgram) -> tuple[str, int, bool]:
+    """Collision model, number of freezes, and if a frozen model has the reference's legs as contact ends."""
+    p = t.problem
+    return p.collision, p.freezes, p.frozen is not None and bounds_reference(p)
 
 
 def _mapped_multipliers(

@@ -13,7 +13,7 @@ from impactopt.planning import lazy_constraints
 from impactopt.planning.lazy_constraints import reference_beyond
 from impactopt.problem import problem as problems
 from impactopt.transcription import mesh
-from impactopt.transcription.initial_guess import first_iterate
+from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.mesh import NO_MORE, nodes_to_add
 
 
@@ -34,15 +34,19 @@ def test_a_reference_that_goes_too_far_gets_rows(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize(("collision", "freezes"), [("full", 0), ("sdc", 0), ("sdc", 2)])
 def test_legs_are_bounded_where_the_reference_is_as_contact_ends(collision: str, freezes: int) -> None:
-    """By the inverse kinematics of a base that coasts down, whose knees bend."""
+    """By the inverse kinematics of a base that coasts down, whose knees bend; in a program that gets the term
+    after a first solution, too.
+    """
     problem = replace(biped_problem(), collision=collision, freezes=freezes)
-    t = transcribed(replace(problem, terms=(*BODILESS, ReferenceRange())))
-    x, c, hit = first_iterate(t), t.coordinates, t.expected
-    y, legs, rates = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x), t.u0.read(x)[0].copy()
-    rates[2] -= 1.0
-    t.u0.write(x, rates)
+    plain = transcribed(replace(problem, terms=BODILESS))
+    x, c, hit = first_iterate(plain), plain.coordinates, plain.expected
+    y, legs = plain.contact_state[0].evaluate(x), plain.contact_legs.evaluate(x)
+    rates = plain.u0.read(x)[0] - np.eye(c.ny)[2]
+    plain.u0.write(x, rates)
     hit.guess_model(x, y, rates, legs)
-    end = c.solve_legs(y + rates * sum(hit.durations(x)), legs)
+    t = transcribed(replace(problem, terms=(*BODILESS, ReferenceRange())))
+    x, *_ = warm_start(t, plain, x, np.zeros(plain.program.m), np.zeros(plain.program.n))
+    end = c.solve_legs(y + rates * sum(t.expected.durations(x)), legs)
     origins, values = t.constraints.origins, t.program.constraints(x)
     place = {each.component: k for k, each in enumerate(origins) if each.term == ReferenceRange.name}
     assert np.abs(end - legs).max() > 0.2

@@ -179,9 +179,7 @@ def longest_stable_step(
     return step
 
 
-def with_step_error(
-    run: Callable[..., Simulation], robot: Robot, reference: Any, scene: Scene, **options: Any
-) -> Simulation:
+def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any) -> Simulation:
     """Simulation by an engine, with an estimate of its impulse's error by the steps.
 
     The step is at most that of `longest_stable_step`. The impulse up to the end of the impact is compared
@@ -189,11 +187,11 @@ def with_step_error(
     with the default. If the error is above 1 %, or the simulation diverges, the step is halved, at most three
     times; a given step longer than the default is kept.
     """
-    given = robot, reference, scene
     # the default of the engine's signature
     own = float((run.__kwdefaults__ or {})["step"])
-    of_servo = {name: options.get(name) for name in ("perturbation", "controller")}
-    longest = longest_stable_step(*given, **of_servo)
+    longest = longest_stable_step(
+        *given, perturbation=options.get("perturbation"), controller=options.get("controller")
+    )
     step = min(float(options.pop("step", own)), longest)
     for left in range(HALVINGS, -1, -1):
         try:

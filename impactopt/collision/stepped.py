@@ -24,7 +24,8 @@ from impactopt.errors import InputError, check_array, check_choice, check_positi
 def law_is_linear(law: ContactLaw) -> bool:
     """True if both branches are linear for all values of the law's parameters; a kink counts as nonlinear.
 
-    So does a force that is not zero where contact begins, as it is cut below zero.
+    So does a force that is cut below zero: one that is not zero where contact begins, or falls with the rate
+    in compression.
     """
     parameters, branches = _law_parts(law)
     x = branches[0][1]
@@ -32,7 +33,8 @@ def law_is_linear(law: ContactLaw) -> bool:
     parts = ca.vertcat(*start, *[ca.jacobian(f, x).T for f, _ in branches])
     found = [_sampled(parameters, law.parameters, parts, x, k) for k in range(_PARAMETER_SETS)]
     # Exactly equal: the slopes of a linear law are expressions without penetration and rate.
-    return all((values == values[0]).all() and not values[:, :2].any() for values in found)
+    linear = all((values == values[0]).all() and not values[:, :2].any() for values in found)
+    return linear and all((values[:, -1] >= 0).all() for values in found)  # slope of compression by the rate
 
 
 def target_is_linear(target: Target) -> bool:

@@ -27,6 +27,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, TorqueLimit, VelocityLimit
 from impactopt.robots.tools import inside
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
+from impactopt.simulation.engines import longest_stable_step
 from impactopt.transcription.initial_guess import strike_rates
 from impactopt.transcription.plan import Completed, Trajectory, complete_reference
 
@@ -122,7 +123,8 @@ def _fastest(problem: ImpactProblem, duration: float, slow: float, fast: float, 
 def _replayed(problem: ImpactProblem, duration: float, speed: float) -> Baseline | None:
     """The reach replayed in full dynamics; None if it violates limits there."""
     scene, reference = scene_of(problem), _reference(problem, duration, speed)
-    simulation = simulate_pinocchio(problem.robot, reference, scene, step=2e-4)
+    step = min(2e-4, longest_stable_step(problem.robot, reference, scene))
+    simulation = simulate_pinocchio(problem.robot, reference, scene, step=step)
     summary = simulation.summary(
         torque_limit=problem.robot.torque_limit, polygon=scene.polygon, planned_impulse=np.nan
     )

@@ -13,11 +13,14 @@ from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, check_array, check_choice, check_kind, check_number, check_whole
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids, UnintendedContact
-from impactopt.simulation.controller import controller_of
+from impactopt.simulation.controller import ControllerSettings, controller_of
+from impactopt.simulation.motors import Servo
 from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
+from impactopt.simulation.pinocchio_robot import recursive_body
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.transcription.plan import Trajectory
 
@@ -125,19 +128,71 @@ ALLOWED = 1e-2  # error of the impulse by the steps, relative
 HALVINGS = 3  # of the step, at most
 ALLOWED_RANGE = 1e-3  # [rad] out of range that is not reported
 COMPARED_AFTER = 0.02  # [s] after the impact up to which two simulations are compared
+STEP_RANGE = (1e-6, 1e-2)  # [s]: below, a replay takes hours; above, it steps over most contacts
+RATE_POSTURES = 8  # of the reference, in which the servo's rate is computed: it varies slowly
+
+
+def longest_stable_step(
+    robot: Robot,
+    reference: Any,
+    scene: Scene,
+    *,
+    perturbation: Perturbation | None = None,
+    controller: ControllerSettings | None = None,
+) -> float:
+    """Longest step [s] with which both engines integrate the servo stably, with a margin; inf without gains.
+
+    It is the reciprocal of the servo's fastest rate, of damping alone or of stiffness alone, with nothing
+    fixed. The engines' rules are explicit in the torque, and stable up to nearly twice as much. Torque limits
+    bound an instability, so that the impulse does not show it, but demand, saturation and gear loads do.
+
+    A servo that is sampled more slowly needs no shorter steps than its period; dampers of joints without a
+    motor do.
+
+    Raises
+    ------
+    InputError : a rate that is too fast for any step.
+    """
+    world = perturbation or Perturbation()
+    period = world.period or (0.0 if controller is None else controller.period)
+    servo = Servo(robot, reference, kp=world.kp, kd=world.kd)
+    body = recursive_body(robot, (), np.zeros(6), scene.strikers, scene.normal)
+
+    def longest(joints: NDArray[np.bool_]) -> float:
+        rates = [0.0]
+        for k in np.unique(np.linspace(0, len(reference.q) - 1, RATE_POSTURES).astype(int)):
+            body.update(np.array(reference.q[k]), np.zeros(robot.nv))
+            damping, stiffness = (
+                body.fastest_rate(np.diag(joints * gains)) for gains in (servo.kd, servo.kp)
+            )
+            rates += [damping, np.sqrt(stiffness)]
+        return 1 / fastest if (fastest := max(rates)) > 0 else np.inf
+
+    step = longest(np.ones(robot.n, dtype=bool))
+    if period > step:
+        step = min(period, longest(robot.passive))
+    if step < STEP_RANGE[0]:
+        raise InputError(
+            f"the servo has a rate of {1 / step:.2g} 1/s, too fast for steps of {STEP_RANGE[0]:g} s; lower "
+            "the perturbation's kp and kd"
+        )
+    return step
 
 
 def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any) -> Simulation:
     """Simulation by an engine, with an estimate of its impulse's error by the steps.
 
-    The impulse up to the end of the impact is compared with that of a simulation with twice the step, or, if
-    the given step is longer than the engine's default, with the default. If the error is above 1 %, or the
-    simulation diverges, the step is halved, at most three times; a given step longer than the default is
-    kept.
+    The step is at most that of `longest_stable_step`. The impulse up to the end of the impact is compared
+    with that of a simulation with twice the step, or, if the given step is longer than the engine's default,
+    with the default. If the error is above 1 %, or the simulation diverges, the step is halved, at most three
+    times; a given step longer than the default is kept.
     """
     # the default of the engine's signature
     own = float((run.__kwdefaults__ or {})["step"])
-    step = float(options.pop("step", own))
+    longest = longest_stable_step(
+        *given, perturbation=options.get("perturbation"), controller=options.get("controller")
+    )
+    step = min(float(options.pop("step", own)), longest)
     for left in range(HALVINGS, -1, -1):
         try:
             simulation = run(*given, **options, step=step)
@@ -146,7 +201,8 @@ def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any)
                 raise
             step /= 2
             continue
-        simulation = replace(simulation, step_error=_step_error(run, given, options, simulation, step, own))
+        error = _step_error(run, given, options, simulation, step, own, longest)
+        simulation = replace(simulation, step_error=error)
         if not simulation.step_error > ALLOWED or step > own:
             break
         step /= 2
@@ -160,16 +216,18 @@ def _step_error(
     simulation: Simulation,
     step: float,
     own: float,
+    stable: float,
 ) -> float:
     """Difference of two simulations' impulses, relative to the larger; nan if both missed the target.
 
-    own [s] : default step of the engine.
+    own, stable [s] : default step of the engine; `longest_stable_step`.
     """
     end = simulation.contact_end
     until = np.inf if np.isnan(end) else end + COMPARED_AFTER
     if simulation.missed or (until == np.inf and step <= own):
         return np.nan
-    for other in (own if step > own else 2 * step, step / 2):
+    others = own if step > own else 2 * step, step / 2
+    for other in others if step < stable else others[1:]:
         # an engine rounds the time at which it ends to steps; up to `last` there are both simulations
         longest = max(step, other)
         last = min(until, options.get("until", np.inf) - longest)
@@ -201,7 +259,6 @@ ENGINES: dict[str, Callable[..., Simulation]] = {
 }
 
 
-STEP_RANGE = (1e-6, 1e-2)  # [s]: below, a replay takes hours; above, it steps over most contacts
 MAX_SETTLE = 60.0  # [s] beyond the motion: a robot that falls has fallen after a tenth of that
 MAX_STEPS = 20_000_000  # an hour of computing
 
@@ -212,8 +269,8 @@ def simulate(
     """Re-simulates a reference for a problem: "pinocchio" fixes the soles, "mujoco" leaves the robot free.
 
     reference : as :class:`impactopt.transcription.plan.Trajectory`.
-    options : of the engine, such as ``step`` [s]; of "mujoco" also ``controller``, "servo" or "wbc", or its
-        settings.
+    options : of the engine, such as ``step`` [s], which is shortened as in :func:`with_step_error`; of
+        "mujoco" also ``controller``, "servo" or "wbc", or its settings.
 
     Raises
     ------

@@ -439,6 +439,29 @@ def test_a_force_below_zero_is_cut_from_a_linear_law():
         assert through_sdc(law, **options) == pytest.approx(expected, rel=1e-3)
 
 
+def test_a_force_below_zero_is_cut_where_it_falls_with_the_rate():
+    """A damper that drives while a spring compresses, in closed form, with either method: no force up to
+    x = d v / k, then an oscillation that grows, and the spring alone back.
+    """
+    k, d, speed = 1e5, 100.0, 1.0
+    law = CustomLaw(
+        compression=lambda x, rate, k, d: k * x - d * rate,
+        restitution=lambda x, rate, k, d: k * x + 0 * d,
+        analytic=True,
+        k=k,
+        d=d,
+    )
+    start, growth, omega = d * speed / k, d / (2 * REDUCED), np.sqrt(k / REDUCED)
+    w = np.sqrt(omega**2 - growth**2)
+    # x = exp(growth t) (start cos(w t) + b sin(w t)), up to where it turns
+    b = (speed - growth * start) / w
+    turn = np.arctan2(growth * start + w * b, w * start - growth * b) / w
+    deepest = np.exp(growth * turn) * (start * np.cos(w * turn) + b * np.sin(w * turn))
+    expected = [REDUCED * (speed + omega * deepest), start / speed + turn + np.pi / 2 / omega]
+    for options in ({}, {"method": "rk4", "step": 1e-5}):
+        assert through_sdc(law, **options) == pytest.approx(expected, rel=1e-3)
+
+
 def test_a_law_written_as_a_class_needs_a_branch():
     with pytest.raises(TypeError, match="branch"):
         ContactLaw()

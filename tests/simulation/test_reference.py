@@ -15,6 +15,7 @@ from impactopt import (
     SDC,
     Board,
     BothSoles,
+    CustomLaw,
     Effects,
     Free,
     FreeMass,
@@ -93,6 +94,18 @@ def test_two_masses(form, mass, target):
     assert result.duration == pytest.approx(duration, abs=2e-9)
     assert result.velocity[0] == pytest.approx(1.3 - impulse / mass, rel=1e-10)
     assert result.sole_wrench is None and result.ground_wrench is None and result.zmp is None
+
+
+@pytest.mark.parametrize("engine", [FullDynamics, MujocoDynamics])
+def test_a_contact_does_not_pull_before_it_presses(engine):
+    """A spring that begins after a gap, in closed form: the force is cut below zero."""
+    law = CustomLaw(compression=lambda x, rate, k, gap: k * (x - gap), analytic=True, k=1e5, gap=1e-3)
+    model = engine(robot=small_robots.slider(2.0), striker="tip", normal=X, law=law, target=TARGET)
+    result = model.collide([0.0], [1.3], [0.0])
+    reduced = 1 / (1 / 2.0 + 1 / TARGET.mass)
+    assert result.impulse == pytest.approx(2 * reduced * 1.3, rel=1e-4)
+    assert result.duration == pytest.approx(1e-3 / 1.3 + np.pi * np.sqrt(reduced / 1e5), rel=2e-3)
+    assert result.force.min() >= 0
 
 
 # ------------------------------------------------------------ an integration of its own

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from support.small_motions import given_until, reference, scene
 from support.small_plans import BODILESS, arm_problem, transcribed
-from support.small_robots import arm, slider
+from support.small_robots import arm, slider, table
 
 from impactopt import (
     Board,
@@ -47,7 +47,7 @@ from impactopt.simulation import (
     simulate_mujoco,
     simulate_pinocchio,
 )
-from impactopt.simulation.engines import check_steps, with_step_error
+from impactopt.simulation.engines import check_steps, longest_stable_step, with_step_error
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.transcription.initial_guess import first_iterate
 
@@ -378,3 +378,41 @@ def test_a_clearance_is_to_the_target_where_it_is_in_the_replay(velocity: float)
     bodies = problem.bodies
     at = Places.of(robot, q[None], np.array([-velocity * (0.1 - still.time[-1])]), np.zeros(1, dtype=np.intp))
     assert still.clearance == pytest.approx(bodies.survey(np.zeros(1), at).clearance, abs=1e-5)
+
+
+# ---- the servo's steps
+
+
+@ENGINES
+def test_steps_resolve_a_servo_that_is_faster_than_the_default_ones(engine: Engine) -> None:
+    """A hammer on a table, whose damper holds it across the blow, at 1.5e4 1/s, against a constant force.
+
+    It yields to v = f / Kd, at which the demand is zero. The blow along the table does not depend on that, so
+    the impulse does not show that the servo is unstable with the engines' default steps, up to its limit.
+    """
+    force, kd, pushed = 1.0, 1.5e4 * MASS / 2, 0.01
+    held = table(MASS, kd=np.array([0.0, kd]))
+    times, push = [0.0, pushed, pushed, pushed + 0.008], 150.0
+    torque = [[push, force], [push, force], [0.0, force], [0.0, force]]
+    ref = reference(times, np.zeros(2), torque=torque, nv=2, n=2)
+    point = np.array([0.5 * push / MASS * pushed**2, 0.0, 0.0])
+    there = scene(point=point, law=SpringDamper(stiffness=1e6, damping=0.0))
+    done = with_step_error(engine, held, ref, there, settle=0.0)
+    assert done.impulse > 0 and done.step_error < 1e-2 and done.saturated == 0
+    assert np.abs(done.demand[:, 1]).max() == pytest.approx(force)
+    assert np.abs(done.v[:, 1]).max() == pytest.approx(force / kd)
+
+
+def test_a_servo_that_is_sampled_needs_no_shorter_steps_than_its_period() -> None:
+    held = slider(1.0, kd=1.5e4, torque_limit=500.0)
+    given = held, reference([0.0, 0.02], np.zeros(1), nv=1, n=1), scene()
+    assert longest_stable_step(*given) == pytest.approx(1 / 1.5e4)
+    for world, longest in (
+        (Perturbation(period=1e-3), 1e-3),
+        (Perturbation(period=1e-5), 1 / 1.5e4),
+        (Perturbation(kd=0.1), 1 / 1.5e3),
+    ):
+        assert longest_stable_step(*given, perturbation=world) == pytest.approx(longest)
+    assert longest_stable_step(slider(1.0, kp=400.0), *given[1:]) == pytest.approx(1 / 20)
+    with pytest.raises(InputError, match=r"servo has a rate of .* 1/s, too fast"):
+        longest_stable_step(*given, perturbation=Perturbation(kd=100.0))

@@ -26,7 +26,8 @@ class CustomLaw(ContactLaw):
     Each number becomes an input `contact_<name>` of a collision, with the value given here as its default.
     The functions are called as ``function(penetration, rate, **numbers)``, with CasADi expressions too:
     write ``casadi.fmax`` and ``casadi.if_else`` in the place of ``max`` and ``if``. They have to agree where
-    the rate is zero. A force below zero is cut; at penetration and rate zero it must not be above.
+    the rate is zero. A force below zero is cut, but in plans with full dynamics, which take the functions as
+    they are; at penetration and rate zero it must not be above.
 
     A plan's search passes through penetrations below zero. There x**1.5 is no number, and at zero it has no
     curvature. Such a force is continued along its tangent below 1e-6 m.

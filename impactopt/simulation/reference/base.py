@@ -99,8 +99,10 @@ class Forces:
         return float(self.target.velocity(state, self.target_parameters))
 
     def contact(self, penetration: float, rate: float, compressing: bool) -> float:
-        """Force [N] of one branch of the law."""
-        return float(self.law.branch(penetration, rate, compressing, self.law_parameters))
+        """Force [N] of one branch of the law, in compression never below zero, as `ContactLaw.force`."""
+        # in restitution a force that falls to zero ends contact
+        force = float(self.law.branch(penetration, rate, compressing, self.law_parameters))
+        return max(force, 0.0) if compressing else force
 
     def contact_slopes(
         self, penetration: float, rate: float, compressing: bool, depth: float, speed: float

@@ -17,7 +17,7 @@ from impactopt import Solution
 from impactopt.errors import InputError
 from impactopt.simulation import Perturbation, Simulation
 
-STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2.5e-5)  # [s]
+STEPS = (7e-4, 2e-4, 1e-4, 5e-5, 2.5e-5)  # [s]; longer ones are shortened for the servo
 STEP = 2e-4  # of the rows that change something else
 FLOOR = Perturbation().floor_time
 COLUMNS = (

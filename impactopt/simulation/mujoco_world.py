@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError, missing_package
-from impactopt.robots.build import parent_body
 from impactopt.robots.couplings import axis_of
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR
@@ -26,6 +25,8 @@ Array = NDArray[np.float64]
 _MAX_IMPEDANCE, _MIN_TIME_CONSTANT = 0.9999, 2.0
 CONTACTS = ("point", "link")  # a striker touches by its striking point, or by the hulls of its link
 CORNER_RADIUS = 0.005  # [m] of the spheres at a sole's corners; they touch the floor where the corner is
+# of a link without mass, as MuJoCo has no moving body without: a microgram, which moves nothing
+MASSLESS = pin.Inertia.FromSphere(1e-9, 0.05)
 MAX_DISTANCE = 0.05  # [m] between link and target; larger distances are not computed
 
 
@@ -234,15 +235,22 @@ def _robot_bodies(
 def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
     """Adds the robot's links and joints; returns the body of each joint of the model, the world first.
 
-    The bodies are named ``body <joint>``, and have no geoms. MuJoCo has no moving body without mass: a joint
-    whose own link has none becomes a joint of the next body in the chain.
+    The bodies are named ``body <joint>``, and have no geoms. A joint without a link of its own, as of an
+    MJCF's body with several, becomes a joint of the next body in the chain. A link without mass is a body
+    of its own, of `MASSLESS`, as strikers and soles may be on it.
     """
     model = robot.model
     bodies = [spec.worldbody] * model.njoints
+    of_links = {frame.parentJoint for frame in model.frames if frame.type != pin.FrameType.JOINT}
+    made = {0}
     for j in range(1, model.njoints):
-        inertia, parent, chain = model.inertias[j], parent_body(model, j), list(model.supports[j])
+        inertia, chain = model.inertias[j], list(model.supports[j])
         if not inertia.mass:
-            continue
+            if j not in of_links:
+                continue
+            inertia = MASSLESS
+        parent = max(made.intersection(chain))  # joints are numbered along their chain
+        made.add(j)
         joints, placement, placements = chain[chain.index(parent) + 1 :], pin.SE3.Identity(), list[Any]()
         for i in joints:
             # placements of all joints of the chain in the body's parent, at zero angles

@@ -33,6 +33,7 @@ from impactopt import (
     Robot,
     SpringDamper,
     Status,
+    Striker,
     Target,
     TargetBody,
 )
@@ -378,6 +379,41 @@ def test_a_clearance_is_to_the_target_where_it_is_in_the_replay(velocity: float)
     bodies = problem.bodies
     at = Places.of(robot, q[None], np.array([-velocity * (0.1 - still.time[-1])]), np.zeros(1, dtype=np.intp))
     assert still.clearance == pytest.approx(bodies.survey(np.zeros(1), at).clearance, abs=1e-5)
+
+
+# ---- the striking link
+
+
+@ENGINES
+def test_a_link_without_mass_strikes_with_the_masses_about_it(engine: Engine) -> None:
+    """A rail; on it turns a link without mass, with the striking point; and on that a mass."""
+    model = pin.Model()
+    for parent, kind, name, mass in (
+        (0, pin.JointModelPX, "rail", MASS / 2),
+        (1, pin.JointModelRX, "turn", 0.0),
+        (2, pin.JointModelRY, "more", MASS / 2),
+    ):
+        joint = model.addJoint(parent, kind(), pin.SE3.Identity(), name)
+        model.addFrame(pin.Frame(f"link {name}", joint, 0, pin.SE3.Identity(), pin.FrameType.BODY))
+        if mass:
+            model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.05), pin.SE3.Identity())
+    robot = Robot.from_model(
+        model,
+        kp=0.0,
+        kd=0.0,
+        torque_limit=1e4,
+        velocity_limit=10.0,
+        position_limit=dict.fromkeys(("rail", "turn", "more"), (-5.0, 5.0)),
+        strikers=[Striker(name="tip", frame="link turn", point=np.array([0.1, 0.0, 0.0]))],
+    )
+    pushed, push = 0.01, 150.0
+    torque = [[push, 0.0, 0.0]] * 2 + [[0.0] * 3] * 2
+    ref = reference([0.0, pushed, pushed, pushed + 0.01], np.zeros(3), torque=torque, nv=3, n=3)
+    point = np.array([0.1 + 0.5 * push / MASS * pushed**2, 0.0, 0.0])
+    there = scene(point=point, law=SpringDamper(stiffness=1e6, damping=0.0), target=FreeMass(mass=3.0))
+    done = engine(robot, ref, there, settle=0.0)
+    speed, reduced = push / MASS * pushed, 1 / (1 / MASS + 1 / 3.0)
+    assert done.impulse == pytest.approx(2 * reduced * speed, rel=1e-3)
 
 
 # ---- the servo's steps

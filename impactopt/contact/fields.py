@@ -173,7 +173,7 @@ def check_numbers(instance: Any) -> None:
         unit = f" [{description.unit}]" if description.unit else ""
         name = f"{type(instance).__name__}: {field.name}{unit}"
         value = getattr(instance, field.name)
-        if isinstance(field.default, bool):
+        if isinstance(field.default, bool) or (_METADATA not in field.metadata and isinstance(value, bool)):
             if not isinstance(value, bool):
                 raise InputError(f"{name} is {value!r}; give True or False")
             continue

@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.collide.contact_states import NOT_APPROACHING
 from impactopt.collision import SDC, Collision
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
@@ -122,6 +123,8 @@ class CollisionPage(LivePage):
         speed, y = float(request[0]), self._y.copy()
         y[c.base :] = request[1:]
         q = c.join(y, self._legs)
+        if speed <= p.target.speed_before():
+            return ShownCollision(q=q, seconds=time.perf_counter() - began, why=NOT_APPROACHING)
         try:
             v = striking_velocity(p.robot, q, p.striker, p.normal, speed, stance=p.stance)
             torque = holding_torque(p.robot, q, v, stance=p.stance)

@@ -19,7 +19,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, ReferenceRange, Slide, Term
 from impactopt.robots.loads import DriveLoads
 from impactopt.robots.robot import Robot
-from impactopt.simulation.target_dynamics import FACE
+from impactopt.simulation.result import FACE
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.mesh import GEAR

@@ -13,6 +13,7 @@ from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, check_array, check_choice, check_kind, check_number, check_whole
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import HitRegion
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids, UnintendedContact
 from impactopt.simulation.controller import ControllerSettings, controller_of
@@ -21,13 +22,13 @@ from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.pinocchio_robot import recursive_body
-from impactopt.simulation.result import Scene, Simulation
+from impactopt.simulation.result import FACE, Scene, Simulation
 from impactopt.transcription.plan import Trajectory
 
 
 def scene_of(problem: ImpactProblem) -> Scene:
     """Target, contact and fixed soles of ``problem``."""
-    p = problem
+    p, region = problem, problem.extra(HitRegion)
     return Scene(
         solids=solids_of(p) if p.keeps_apart else Solids(),
         point=p.point,
@@ -43,6 +44,7 @@ def scene_of(problem: ImpactProblem) -> Scene:
         polygon=support_polygon(p.robot, p.coordinates),
         standing=p.standing if p.stances else np.zeros((0, 0), dtype=bool),
         polygons=tuple(support_polygon(p.robot, c) for c in p.stance_coordinates) if p.stances else (),
+        face=FACE + (region.reach if region is not None else 0.0),
     )
 
 

@@ -21,6 +21,7 @@ from impactopt.simulation.collision_geometry import Solids, UnintendedContact
 from impactopt.simulation.motors import MotorCut
 
 Array = NDArray[np.float64]
+FACE = 0.2  # [m] radius of the target's surface about where it may be hit, across the normal
 MAX_GAP = 5e-3  # [s] between touches that belong to one impact
 PHASES = ("swing", "collision", "follow")
 PHASES_OF_MISS = ("swing", "missed")  # before and after the planned contact
@@ -92,6 +93,7 @@ class Scene:
     second : frame and point (3,) [m] of another striker that hits the same target
     standing : (stances, soles) soles that stand in each stance phase; (0, 0): one stance, on all
     polygons : support polygon of each stance phase; (): one stance
+    face [m] : radius of the target's surface about the point, across the normal
     """
 
     point: Array
@@ -108,6 +110,7 @@ class Scene:
     second: tuple[str, Array] | None = None
     standing: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     polygons: tuple[Array, ...] = ()
+    face: float = FACE
 
     @property
     def strikers(self) -> tuple[str, ...]:

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from impactopt.errors import InputError
-from impactopt.simulation.result import Scene
+from impactopt.simulation.result import FACE, Scene
 
 Array = NDArray[np.float64]
 State = TypeVar("State")
 Move = Callable[[float], tuple[State, bool]]
-FACE = 0.2  # [m] radius of the target's surface about the hit point, across the normal
 MAX_SWITCHES = 20  # of a target within one step
 BISECTIONS = 30  # of a step, to locate a switch, or a begin or end of contact
 # Tolerances of the contact within a step. The absolute one is in m, N s and units of the target's state.
@@ -63,6 +62,7 @@ class TargetContact:
         points = [scene.point, *([] if scene.second is None else [scene.second[1]])]
         # tuples of floats: with three components, arrays would take several times as long
         self._points, self._normal = [tuple(p.tolist()) for p in points], tuple(scene.normal.tolist())
+        self._face = scene.face**2
         self.untouched: Array = np.zeros(self.target.n_states)
         # read once, because every step uses them
         self._law_parameters, self._target_parameters = self.law.parameters, self.target.parameters
@@ -89,7 +89,7 @@ class TargetContact:
             dx, dy, dz = x - px, y - py, z - pz
             along = nx * dx + ny * dy + nz * dz
             across = (dx - along * nx) ** 2 + (dy - along * ny) ** 2 + (dz - along * nz) ** 2
-            depths.append(-np.inf if across > FACE**2 else along - travel)
+            depths.append(-np.inf if across > self._face else along - travel)
         return np.array(depths)
 
     def forces(self, depths: Array, speeds: Array, state: Array) -> Array:

@@ -72,7 +72,10 @@ class VariedKeys:
         section : of the sweep file, "set" or "at_contact".  given : keys in it, each with its key path.
         """
         for key, path in given:
-            place = self._place(self._base.data, path)
+            try:
+                place = self._place(self._base.data, path)
+            except InputError:  # no key that could vary
+                continue
             for varied, at in self._seen.items():
                 # a part of a constant may vary, as a coordinate of a point
                 if place[: len(varied)] == varied:

@@ -382,12 +382,25 @@ def test_a_custom_law_is_its_class_written_out_and_its_numbers_are_inputs():
         ({"compression": lambda x, rate: np.array([x])}, "gives an array; give one expression"),
         ({"compression": lambda x, rate: x * math.sqrt(x)}, "has NaN in its expression: .*casadi.sqrt"),
         ({"compression": lambda x, rate, k: k * ca.log(-x), "k": 1e4}, "0.1 mm deep, is nan N"),
-        ({"compression": lambda x, rate, k: k * x, "k": -1e4}, "is -100 N, .*a force that pushes"),
+        ({"compression": lambda x, rate, k: k * x, "k": -1e4}, "is -100 N in .*a force that pushes"),
     ],
 )
 def test_custom_laws_that_cannot_work_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         CustomLaw(**options)
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda x, rate: -500.0 * ca.log(1 - x / 5e-3),  # a foam of 5 mm
+        lambda x, rate: 1e3 * (ca.exp(x / 1e-5) - 1),
+        lambda x, rate: 1e5 * (x - 0.02),  # behind a gap
+    ],
+    ids=["foam", "exponential", "gap"],
+)
+def test_laws_may_have_no_force_at_depths_that_are_not_reached(formula):
+    assert CustomLaw(compression=formula).parameters == {}
 
 
 @pytest.mark.parametrize(

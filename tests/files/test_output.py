@@ -321,6 +321,15 @@ def test_a_record_of_the_first_format_has_todays_names(record: Record, tmp_path:
     }
 
 
+def test_a_record_without_the_kinds_of_joints_is_one(record: Record, tmp_path: Path) -> None:
+    """As those that were saved before there were any."""
+    numbers, _ = save_record(record, tmp_path)
+    with np.load(numbers) as file:
+        arrays = {key: file[key] for key in file.files if key != "prismatic"}
+    np.savez(numbers, **arrays)
+    assert not load_record(tmp_path).slides
+
+
 def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "solution.npz"
     path.write_bytes(b"old")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,13 @@ def test_where_there_is_no_collision_the_page_says_why(
     assert look.wait(LONG)
     assert look.shown.collision is None
     assert look.text.content == "**No collision.** the hand cannot move along the normal"
+
+
+def test_a_target_that_flees_is_not_hit() -> None:
+    fleeing = replace(load_problem(FILE), target=FreeMass(mass=2.0, initial_velocity=20.0))
+    with CollisionPage(fleeing) as made:
+        assert made.wait(LONG)
+        assert made.shown.collision is None and "moves away" in made.text.content
 
 
 def test_a_slider_has_the_unit_of_its_joint(look: CollisionPage) -> None:

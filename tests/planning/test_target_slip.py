@@ -14,6 +14,8 @@ from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.planning import lazy_constraints
 from impactopt.planning.lazy_constraints import FAR, slide, slide_caution, slides_beyond
 from impactopt.problem import problem as problems
+from impactopt.simulation import scene_of
+from impactopt.simulation.target_dynamics import TargetContact
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.transcription.initial_guess import first_iterate
 
@@ -90,3 +92,14 @@ def test_in_a_region_a_slide_begins_where_the_striker_hits() -> None:
     program = transcribed(replace(problem, terms=(*BODILESS, region, Slide()))).program
     rows = [i for i in range(program.m) if program.constraint_name(i).startswith("slide")]
     np.testing.assert_allclose(program.constraints(found.result.x)[rows], end - hit, atol=1e-6)
+
+
+def test_the_face_in_replays_is_beyond_the_region() -> None:
+    """A slide from the region's edge stays on it."""
+    problem, region = arm_problem(), HitRegion(size=(0.36, 0.02))
+    tangent = across(problem.normal)[0]
+    places = problem.point + np.outer([0.19, 0.37, 0.39], tangent) + 1e-3 * problem.normal
+    for terms, on_it in ((BODILESS, [True, False, False]), ((*BODILESS, region), [True, True, False])):
+        there = TargetContact(scene_of(replace(problem, terms=terms)))
+        hit = [there.depths(place[None], 0.0)[0] > 0 for place in places]
+        assert hit == on_it

@@ -153,6 +153,15 @@ def test_a_setting_that_varies_is_refused_without_a_line_that_no_file_has(tmp_pa
     assert coordinate.design.cases == 2, "a coordinate of a constant point may vary"
 
 
+def test_constants_that_no_collision_depends_on_are_let_be(tmp_path: Path) -> None:
+    """They are those of a problem whose plans are swept, too."""
+    text = (
+        TEXT.replace('"strike"', '"collision"')
+        + "\n[at_contact]\nspeed_m_s = 1.0\n[set]\nswing.duration = 1.0"
+    )
+    assert read_sweep_file(written(tmp_path, text)).design.cases == 2
+
+
 def test_sweeps_of_the_package_go_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     found = read_sweep_file("collision_target")

@@ -39,7 +39,8 @@ class ContactLaw(Described, ABC):
     To write one, make a frozen dataclass whose fields are its parameters, and implement `branch`. The
     branches have to agree where the rate is zero; contact ends when the force of the restitution branch has
     fallen to zero. When a law is made, both branches are called with CasADi expressions and compared at rate
-    zero, and fields with `impactopt.contact.fields.about` as metadata are checked.
+    zero. Its fields have to be numbers, in the ranges of `impactopt.contact.fields.about` as their metadata,
+    or True and False.
 
     Attributes
     ----------
@@ -74,20 +75,18 @@ class ContactLaw(Described, ABC):
             type(self)._symbolic = True
         forces = {depth: [float(self.branch(depth, 0.0, c)) for c in phases] for depth in _DEPTHS}
         for depth, (there, back) in forces.items():
+            of = f"{name}: the force at rate zero, {1e3 * depth:g} mm deep, is {there:g} N in compression"
             if not np.isfinite([there, back]).all():
-                raise InputError(
-                    f"{name}: the force at rate zero, {1e3 * depth:g} mm deep, is {there:g} N in compression "
-                    f"and {back:g} N in restitution; give finite ones"
-                )
+                if depth == _DEPTHS[0]:
+                    raise InputError(f"{of} and {back:g} N in restitution; give finite ones")
+                break  # some laws, as of a foam, have no force at depths that they never reach
             if abs(there - back) > _SAME * max(abs(there), abs(back)):
-                raise InputError(
-                    f"{name}: the force at rate zero, {1e3 * depth:g} mm deep, is {there:g} N in compression "
-                    f"and {back:g} N in restitution: write branches that agree there"
-                )
-        if np.max([*forces.values()]) < 0:
+                raise InputError(f"{of} and {back:g} N in restitution: write branches that agree there")
+        first, last = (np.array(forces[depth]) for depth in (_DEPTHS[0], _DEPTHS[-1]))
+        if (np.array([*forces.values()]) < 0).all() and (last <= first).all():
             raise InputError(
-                f"{name}: the force at rate zero, {1e3 * depth:g} mm deep, is {there:g} N, and negative at "
-                "smaller depths too, so that nothing is hit; give a force that pushes, which is positive"
+                f"{of}, and negative at smaller depths too, so that nothing is hit; give a force that "
+                "pushes, which is positive"
             )
 
     @property

@@ -35,7 +35,8 @@ class Target(Described, ABC):
     To write one, make a frozen dataclass whose fields are its parameters, and implement the methods below.
     They have to be smooth, except where one of `switches` changes its sign. `state` is a column of `n_states`
     numbers or CasADi symbols; it is zero when contact begins. When a target is made, its methods are called
-    with CasADi expressions, and fields with `impactopt.contact.fields.about` as metadata are checked.
+    with CasADi expressions. Its fields have to be numbers, in the ranges of `impactopt.contact.fields.about`
+    as their metadata, or True and False.
 
     Attributes
     ----------

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
 
-REACH = 0.2  # [m] from the hit point to the edge of the target's face in replays
+REACH = 0.2  # [m] from the hit point to the edge of the largest region
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class HitRegion(Term):
     """The hit point may be anywhere in a disc or a rectangle about `point_m`; give one of the two keys.
 
     The region is in the plane across the normal, with the axes of :func:`impactopt.bodies.world.face_axes`.
-    It reaches no farther than 0.2 m, as the target in replays.
+    It reaches no farther than 0.2 m. The face of the target in replays ends 0.2 m beyond it.
     """
 
     name: ClassVar[str] = "hit region"
@@ -44,14 +44,18 @@ class HitRegion(Term):
         super().__post_init__()
         given: Any = self.size if self.radius is None else [self.radius]
         lengths = check_array("HitRegion [m]", given, (None,))
-        reach = float(lengths.sum()) if self.size is None else float(np.linalg.norm(lengths)) / 2
-        if len(lengths) != (1 if self.size is None else 2) or not (lengths > 0).all() or reach > REACH:
+        if len(lengths) != (1 if self.size is None else 2) or not (lengths > 0).all() or self.reach > REACH:
             raise InputError(
                 f"HitRegion of {lengths.tolist()} m: give lengths > 0 that reach no further than {REACH} m "
                 "from the point"
             )
         if self.size is not None:
             object.__setattr__(self, "size", (float(lengths[0]), float(lengths[1])))
+
+    @property
+    def reach(self) -> float:
+        """Distance [m] of its edge, or of its corners, from the hit point."""
+        return float(np.linalg.norm(self.size)) / 2 if self.size is not None else float(self.radius or 0.0)
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         disc = self.size is None

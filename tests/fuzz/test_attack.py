@@ -246,9 +246,16 @@ def test_collisions_are_the_same_with_and_without_a_compiler(monkeypatch: pytest
 
 
 def test_replays_are_those_of_an_equation_of_their_own(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    impulses: list[Any] = []
+
+    def remembered(*given: Any) -> Any:
+        impulses.append(follow(*given))
+        return impulses[-1]
+
+    monkeypatch.setattr(attack_replays, "follow", remembered)
     found = replay_one(result, SEED, 0)
     assert (found.replays, found.off, found.refused, found.unjudged) == (2, 0, 0, 0)
-    monkeypatch.setattr(attack_replays, "follow", lambda *given: 1.02 * follow(*given))
+    monkeypatch.setattr(attack_replays, "follow", lambda *_: 1.02 * impulses.pop(0))
     found = replay_one(result, SEED, 0)
     assert found.off == 2 and "seed 20, number 0" in found.faults[0]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import impactopt
@@ -64,19 +64,30 @@ def own_name(name: str) -> str:
     return f"impactopt.{impactopt._EXPORTS.get(name, name)}"
 
 
-def imports(file: Path) -> Iterator[str]:
+@cache
+def nodes(file: Path) -> list[ast.AST]:
+    """Nodes of a file that import or call."""
+    kinds = (ast.Import, ast.ImportFrom, ast.Call)
+    return [node for node in ast.walk(ast.parse(file.read_text("utf-8"))) if isinstance(node, kinds)]
+
+
+def imports(file: Path) -> list[str]:
     """Absolute names of the modules that a file imports, lazily too."""
-    inside = ("impactopt", *file.relative_to(PACKAGE).parts[:-1])
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    inside, found = ("impactopt", *file.relative_to(PACKAGE).parts[:-1]), list[str]()
+    for node in nodes(file):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = inside[: len(inside) - node.level + 1] if node.level else ()
             module = ".".join([*above, *([node.module] if node.module else [])])
             # `from impactopt import sweep` names a module, or something of the package's own
-            yield from [own_name(alias.name) for alias in node.names] if module == "impactopt" else [module]
-        elif isinstance(node, ast.Call) and "import_module" in ast.dump(node.func):
-            yield from (str(a.value) for a in node.args if isinstance(a, ast.Constant))
+            found += [own_name(alias.name) for alias in node.names] if module == "impactopt" else [module]
+        elif isinstance(node, ast.Call):
+            # both import_module(...) and importlib.import_module(...)
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            if name == "import_module":
+                found += [str(a.value) for a in node.args if isinstance(a, ast.Constant)]
+    return found
 
 
 def room(file: Path) -> str:
@@ -96,7 +107,7 @@ ROOMS = {room(file) for file in FILES}
 def modules_imported(file: Path) -> set[str]:
     """Modules of the package that a file imports: in functions, for types alone, by its own names too."""
     found = set[str]()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes(file):
         if isinstance(node, ast.ImportFrom) and node.module == "impactopt":
             found |= {own_name(alias.name) for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:

@@ -161,6 +161,8 @@ def longest_stable_step(
     body = recursive_body(robot, (), np.zeros(6), scene.strikers, scene.normal)
 
     def longest(joints: NDArray[np.bool_]) -> float:
+        if not joints.any():
+            return np.inf
         rates = [0.0]
         for k in np.unique(np.linspace(0, len(reference.q) - 1, RATE_POSTURES).astype(int)):
             body.update(np.array(reference.q[k]), np.zeros(robot.nv))

@@ -304,7 +304,7 @@ def robustness(
         `if __name__ == "__main__":`.
     controller : settings of a whole-body controller, whose rate takes the place of the ranges' period; None:
         the joints' servo.
-    step [s] : of the simulation; shorter where the impulse needs it, as in `validate`.
+    step [s] : of the simulation; shorter where the impulse or the servo needs it, as in `validate`.
     progress : called with the number of finished replays, and of all.
 
     A replay that diverges, whose halved steps still leave more than 1 % of its impulse uncertain, or whose

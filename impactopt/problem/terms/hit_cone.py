@@ -42,14 +42,11 @@ class HitCone(Term):
         return {"hit_cone": BlockRecipe(lambda: hit_cone(coordinates, problem.striker))}
 
     def add_constraints(self, program: Any) -> None:
-
-        def numbers(problem: Any) -> Any:
-            before = float(problem.target.speed_before())
-            return np.array([*face_axes(problem.normal).ravel(), before, np.tan(self.angle)])
-
-        y, y1, _ = program.contact_state
-        at = program.add_block("hit_cone", [[y, y1, program.contact_T]], numbers(program.problem))
-        program.builder.follow(lambda b: b.block("hit_cone").take_parameters(numbers(b.problem)))
+        problem, (y, y1, _) = program.problem, program.contact_state
+        # none of these is a parameter that a built program may change
+        before = problem.target.speed_before()
+        numbers = np.array([*face_axes(problem.normal).ravel(), before, np.tan(self.angle)])
+        at = program.add_block("hit_cone", [[y, y1, program.contact_T]], numbers)
         program.constraints.add(
             term=self.name,
             place="contact",

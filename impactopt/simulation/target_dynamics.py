@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -162,9 +161,12 @@ class TargetContact:
             )
         end, impulses = found.y[:, -1], found.y[h : 2 * h]
 
-        @cache
+        known = {t: forces(t, y)[0] for t, y in zip(found.t, found.y.T, strict=True)}
+
         def found_forces(t: float) -> Array:
-            return forces(t, found.sol(t))[0]
+            if t not in known:
+                known[t] = forces(t, found.sol(t))[0]
+            return known[t]
 
         times = _with_both_sides(found.t, lambda t: bool(found_forces(t).any()))
         values = np.array([found_forces(t) for t in times])

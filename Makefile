@@ -16,12 +16,12 @@ STUDY  := PYTHONPATH=tests $(BIN)/python -m
 named = $(if $(filter-out -%,$(firstword $(ARGS))),,$(1)) $(ARGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint types format bench attack robots reproduce figures docs notebooks clean distclean
+.PHONY: help venv demo test slow lint types format bench attack robots reproduce figures docs notebooks clean distclean
 
 help: ## list the targets
 	@echo "make <target>"
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  \1|\2/p' $(firstword $(MAKEFILE_LIST)) | awk -F'|' '{printf "%-12s %s\n", $$1, $$2}'
-	@echo "Options: ARGS='...' for test, demo, bench, attack and reproduce; PYTHON=... for the interpreter that makes .venv"
+	@echo "Options: ARGS='...' for test, slow, demo, bench, attack and reproduce; PYTHON=... for the interpreter that makes .venv"
 
 venv: $(STAMP) ## make .venv with this project and what it needs
 
@@ -61,9 +61,13 @@ $(BROWSER): $(STAMP)
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet --editable '.[browser]'
 	@touch $@
 
-test: $(STAMP) $(BROWSER) ## run the tests (ARGS='-k robot' for some of them)
-	@echo "== running the tests (the first run compiles functions)"
-	@$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
+test: $(STAMP) $(BROWSER) ## run the quick tests, nine in ten (ARGS='-k robot' for some of them)
+	@echo "== running the quick tests (the first run compiles functions); \`make slow\` runs the others"
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m 'not slow' $(ARGS)
+
+slow: $(STAMP) $(BROWSER) ## run the slow tests: whole plans in both engines, drafts, clusters, pages
+	@echo "== running the slow tests"
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m slow $(ARGS)
 
 lint: $(STAMP) ## check style with ruff
 	@echo "== ruff"

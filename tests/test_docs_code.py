@@ -12,7 +12,11 @@ from impactopt import InputError
 
 # `text`: what a program prints, pictures of words; braces: directives of the site
 KNOWN = ("python", "toml", "sh", "text")
-WITH_BLOCKS = [page for page in PAGES if {"python", "toml", "sh"} & set(languages(page))]
+WITH_BLOCKS = [
+    page if page.name == "README.md" else pytest.param(page, marks=pytest.mark.slow)
+    for page in PAGES
+    if {"python", "toml", "sh"} & set(languages(page))
+]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -57,6 +57,7 @@ def pages(site: Path) -> dict[Path, Page]:
     return {file: Page(file) for file in sorted(site.rglob("*.html"))}
 
 
+@pytest.mark.slow
 def test_every_public_name_is_in_the_reference(pages: dict[Path, Page]) -> None:
     described = set().union(*(page.anchors for page in pages.values()))
     public = {f"impactopt.{name}" for name in impactopt.__all__ if name != "__version__"}

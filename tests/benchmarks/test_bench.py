@@ -66,6 +66,7 @@ def quiet(_text: str) -> None:
 
 
 # ---------------------------------------------------------------- robustness
+@pytest.mark.slow
 def test_robustness_says_how_many_stand_and_keeps_every_draw() -> None:
     report = robustness.run(quiet, draws=2, workers=1)
     numbers = report.numbers
@@ -208,6 +209,7 @@ def run(*arguments: str) -> Any:
     return runner.invoke(app, [*arguments])
 
 
+@pytest.mark.slow
 def test_json_has_the_keys_that_are_promised() -> None:
     result = run("robustness", "problems/punch.toml", "--draws", "1", "--workers", "1", "--json")
     assert result.exit_code == 0, result.output
@@ -225,6 +227,7 @@ def test_out_keeps_numbers_and_pictures(planner: Planner) -> None:
     assert json.loads(Path("kept/replay.json").read_text(encoding="utf-8")).keys() >= HEADS
 
 
+@pytest.mark.slow
 def test_all_runs_every_bench(planner: Planner, monkeypatch: pytest.MonkeyPatch) -> None:
     planner.kind = FirstOrder
     benches = {name: f"benchmarks.{name}" for name in ("truth", "robustness", "replay")}

@@ -42,6 +42,7 @@ def bases() -> dict[float, dict[str, Any]]:
     return {row["M_g"]: row for row in report.numbers["rows"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["error_model", "error_literal", "impulse_error_model", "error_60_digits"])
 def test_the_virtual_base_s_error_falls_with_its_mass(bases: dict[float, dict[str, Any]], key: str) -> None:
     masses = [1e3, 1e4, 1e5, 1e6]  # 1e2 kg is no more than the robot's own mass: the law's beginning
@@ -157,6 +158,7 @@ def test_mujoco_gets_each_pair_of_posture_speed_and_gains_once() -> None:
         assert len({(i, j) for i, j in places[[a, b]].T.tolist()}) == 9
 
 
+@pytest.mark.slow
 def test_freezing_again_makes_it_better_and_a_point_mass_is_far_off(short: Report) -> None:
     rows = {(row["model"], row["freezes"]): row for row in short.numbers["rows"]}
     virtual, once, again = (rows[fidelity.model, fidelity.freezes] for fidelity in SHORT)

@@ -23,6 +23,7 @@ damping_N_m_s_rad = 0.5
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_a_row_a_limit(tmp_path: Path) -> None:
     """Of an arm that holds its hammer firmly, and one that does so softly."""
@@ -64,6 +65,7 @@ def test_a_plan_that_is_none_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not report.figures["machine"]().axes[0].lines
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_half_the_armature_spares_the_gear() -> None:
     """A rotor takes its share of the blow through the gear: half of it, less."""

@@ -173,6 +173,7 @@ def test_a_plan_is_replayed_as_planned_without_target_and_under_draws(world: Wor
     assert row["slip_p95_mm"] == pytest.approx(1e3 * np.quantile(stands, 0.95))
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_not_solved_is_a_row_with_its_status(world: World) -> None:
     world.status = {1: Status.TIME_LIMIT}
     report = measured()

@@ -11,6 +11,7 @@ from benchmarks.registry import run_bench
 from impactopt.codegen.compiler import find_compiler
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_a_row_a_model() -> None:
     said: list[str] = []

@@ -25,6 +25,7 @@ factor = [0.1, 10.0]
 """
 
 
+@pytest.mark.slow
 def test_a_row_a_factor_and_one_with_what_is_chosen(tmp_path: Path) -> None:
     """What a file leaves open itself is not: the bench asks about the grip alone."""
     text = (DEMO.parent / "arm_planar.toml").read_text().replace('robot = "planar_arm"\n', "")

@@ -177,6 +177,7 @@ def deadly(how: str, _start: int) -> Any:
     return Deadly(how), np.array([1.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "status", "message"),
     [
@@ -208,6 +209,7 @@ def textbook(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_command_keeps_every_solve_and_takes_them_up(textbook: Path) -> None:
     run = [
         "solve",
@@ -280,6 +282,7 @@ def test_infeasible_programs_are_told_by_our_solvers() -> None:
         assert SOLVERS[solver].run(program, x0, 10.0).status is Status.INFEASIBLE
 
 
+@pytest.mark.slow
 def test_strikes_have_rows_of_their_own(tmp_path: Path) -> None:
     file = tmp_path / "solve.jsonl"
     found = solve.run(

@@ -223,6 +223,7 @@ def test_what_takes_long_is_timed_less() -> None:
     assert len(calls) == 2 + 3
 
 
+@pytest.mark.slow
 @compiled
 def test_the_bench_of_collisions_has_each_method_and_the_default_s_ratios(setup: Setup) -> None:
     numbers = collision.run(quiet, setups=[setup], quick=True, repeats=3).numbers
@@ -366,6 +367,7 @@ def test_exponents_are_those_of_the_upper_half() -> None:
     assert scaling.exponents(rows[:1]) == []
 
 
+@pytest.mark.slow
 def test_legends_of_scaling_leave_the_data_free() -> None:
     rows = [made_up("chain", n, 2.6) for n in (2, 8, 32, 100)] + [made_up("tree", n, 2.1) for n in (8, 100)]
     rows += [made_up(name, n, 2.3) for name, n in (("standin", 28), ("talos", 30), ("g1", 29))]

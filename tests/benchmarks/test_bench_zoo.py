@@ -69,6 +69,7 @@ def test_draws_are_within_what_is_said_and_fill_it(punch: ImpactProblem) -> None
     assert 150 < sum(d["striker"] == "left_hand" for d in drawn) < 250
 
 
+@pytest.mark.slow
 def test_a_point_out_of_reach_is_drawn_again(punch: ImpactProblem) -> None:
     around = (0.5, 0.01, 0.01)
     for k in range(20):
@@ -129,6 +130,7 @@ def solver(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, punch: ImpactProblem
     return solver
 
 
+@pytest.mark.slow
 def test_every_problem_is_a_row_whatever_becomes_of_it(solver: Solver) -> None:
     report = run(quiet, random=8, robot="standin", seed=3)
     numbers = report.numbers
@@ -148,6 +150,7 @@ def test_every_problem_is_a_row_whatever_becomes_of_it(solver: Solver) -> None:
     assert [len(list(table.columns[0].cells)) for table in report.tables] == [8, 8]
 
 
+@pytest.mark.slow
 def test_a_robots_problems_are_the_same_however_many_are_drawn(solver: Solver) -> None:
     def drawn(**options: Any) -> dict[str, Any]:
         rows = run(quiet, seed=1, **options).numbers["rows"]
@@ -159,6 +162,7 @@ def test_a_robots_problems_are_the_same_however_many_are_drawn(solver: Solver) -
     assert len({str(numbers) for numbers in many.values()}) == 6
 
 
+@pytest.mark.slow
 def test_rows_are_kept_as_they_come_and_taken_up(solver: Solver) -> None:
     class Stopped(BaseException):
         pass
@@ -197,6 +201,7 @@ def test_cleanliness_is_read_where_the_summary_has_it() -> None:
     assert made["stands"] is True and {name: made[name] for name in nothing} == nothing
 
 
+@pytest.mark.slow
 def test_clean_ones_are_counted(solver: Solver, monkeypatch: pytest.MonkeyPatch) -> None:
     found = iter(({"clean": True}, {"clean": False}))
     monkeypatch.setattr(zoo, "cleanliness", lambda *_: next(found))

@@ -197,6 +197,7 @@ def test_table1_measures_masses_and_speeds(small: list[Case]) -> None:
     assert row["joints_rad"].keys() == set(small[0].robot.joint_names)
 
 
+@pytest.mark.slow
 def test_table2_and_fig7_have_every_model_beside_the_papers_numbers(small: list[Case]) -> None:
     report = table2.run(quiet, fidelities=SHORT)
     rows, numbers = report.numbers["rows"], report.numbers
@@ -237,6 +238,7 @@ def test_a_robot_that_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPat
 
 
 # ---------------------------------------------------------------- command
+@pytest.mark.slow
 def test_all_keeps_everything_under_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "REPRODUCED", ("table3", "table1"))
     result = runner.invoke(app, ["all", "--json", "--quiet", "--out", str(tmp_path)])

@@ -209,6 +209,7 @@ def test_the_baseline_is_reported_beside_the_plan(
     assert "no reach keeps the limits" in out
 
 
+@pytest.mark.slow
 def test_replays_side_by_side_are_those_of_one_process(planner: Planner, file: Path, tmp_path: Path) -> None:
     summaries = []
     for workers in (1, 2):

@@ -61,6 +61,7 @@ def file(tmp_path: Path) -> Path:
 
 
 # ---------------------------------------------------------------- check, new, problems, robots
+@pytest.mark.slow
 def test_check_tells_the_hash_and_takes_settings(file: Path) -> None:
     out, _ = run("check", file)
     assert "is sound" in out and load_problem(file).hash in out

@@ -113,6 +113,7 @@ PROGRAMS: dict[str, tuple[dict[str, Any], Callable[[SDC], Any]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "branch"),
     # of narrower vectors one program of each kind: all others go through the same headers

@@ -74,6 +74,7 @@ def situation(seed: int) -> tuple[Any, Any, Any]:
 
 
 # ---------------------------------------------------------------- NumPy's steps are those in C
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="nothing to compare with")
 @pytest.mark.parametrize("contact", CONTACTS)
 def test_steps_in_numpy_are_those_in_c(contact: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,6 +182,7 @@ def test_stiff_and_light_collisions_are_right_with_any_compiler(
     assert found["separated"].all()
 
 
+@pytest.mark.slow
 def test_many_collisions_of_a_stiff_contact_are_those_of_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     def found() -> Any:
         changes = {"contact.stiffness": [1e5, 5e6]}
@@ -193,6 +195,7 @@ def test_many_collisions_of_a_stiff_contact_are_those_of_a_compiler(monkeypatch:
 
 
 # ---------------------------------------------------------------- each row by its own estimate
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["rk4", "implicit"])
 def test_every_row_is_right_or_refused(method: str) -> None:
     law, names = HuntCrossley(stiffness=1e6, dissipation=0.1), ("stiffness", "dissipation")

@@ -35,6 +35,7 @@ BENDING = ContactFriction(coefficient=0.6, stiffness=0.8 * WALL_STIFFNESS)
 NO_CREEP = 1e-7  # [m/s]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "options"),
     [(FullDynamics, {}), (MujocoDynamics, {}), (SDC, {"step": 1e-5}), (VirtualMass, {"step": 1e-5})],
@@ -52,6 +53,7 @@ def test_a_mass_that_sticks_swings_with_the_frequency_of_its_bristles(
     assert found.velocity[1] / across == pytest.approx(swing, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_ball_that_sticks_gives_its_spin_back() -> None:
     """Its rim turns around with all energy (Garwin, Am. J. Phys. 37, 1969); without bristles it stops."""
     mass, radius, stiffness, spin = 4.0, 0.1, 1e10, 0.1
@@ -139,6 +141,7 @@ def test_friction_pushes_against_the_slide_in_the_tangent_plane() -> None:
     assert np.abs(found.velocity - without).max() > 0.03  # and bristles matter
 
 
+@pytest.mark.slow
 def test_mujoco_agrees() -> None:
     robot, n = arm(), np.array([0.0, 0.8, 0.6])
     q = robot.posture("start")
@@ -170,6 +173,7 @@ def oblique(kind: Any = SDC, **options: Any) -> tuple[Any, tuple[Any, Any, Any]]
     return model, (q, v, holding_torque(robot, q, v))
 
 
+@pytest.mark.slow
 def test_frozen_dynamics_come_to_full_dynamics() -> None:
     model, at = oblique(FullDynamics)
     full = model.collide(*at)

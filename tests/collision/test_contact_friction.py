@@ -52,6 +52,7 @@ def sliding(across: float, friction: ContactFriction | None, kind: Any = FullDyn
     return model.collide(np.zeros(2), np.array([1.0, across]), np.zeros(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [FullDynamics, SDC, VirtualMass])
 def test_a_mass_that_slides_all_along_loses_mu_times_the_impulse(kind: Any) -> None:
     for across in (4.0, -6.0):
@@ -64,6 +65,7 @@ def test_a_mass_that_slides_all_along_loses_mu_times_the_impulse(kind: Any) -> N
         assert found.impulse == pytest.approx(without.impulse, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_mass_that_hardly_slides_sticks() -> None:
     # it has 0.4 N s across, and friction could take half of some 7 N s
     assert abs(sliding(0.2, ROUGH).velocity[1]) < 1e-6
@@ -84,6 +86,7 @@ def oblique(kind: Any = SDC, **options: Any) -> tuple[Any, tuple[Any, Any, Any]]
     return kind(**shared, **options), (q, v, holding_torque(robot, q, v))
 
 
+@pytest.mark.slow
 def test_frozen_dynamics_come_to_full_dynamics_with_friction_too() -> None:
     model, at = oblique(FullDynamics, contact_friction=GENTLE)
     full = model.collide(*at)
@@ -177,6 +180,7 @@ def test_many_frozen_collisions_have_friction_of_their_own() -> None:
     assert np.ptp(alone) > 1e-2 * np.mean(alone)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("across", "spin", "sticks"), [(0.0, 30.0, False), (3.0, -5.0, False), (0.2, 0.5, True)]
 )
@@ -223,6 +227,7 @@ def test_the_change_of_momentum_is_in_the_cone() -> None:
     assert across @ (hand - n * (n @ hand)) > 0  # against the slide
 
 
+@pytest.mark.slow
 def test_mujoco_agrees() -> None:
     robot = arm()
     q = robot.posture("start")
@@ -248,6 +253,7 @@ def test_derivatives_are_those_of_differences(friction: ContactFriction) -> None
     check_derivatives(t.program, x + 0.01 * np.random.default_rng(1).standard_normal(len(x)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("friction", "within", "apart"),
     [(GENTLE, 5e-3, 5e-3), (ContactFriction(coefficient=0.4, stiffness=8e3), 2e-3, 4e-3)],

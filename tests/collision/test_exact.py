@@ -94,6 +94,7 @@ def test_two_masses_in_closed_form(mass: float, target: float, ratio: float) -> 
 
 
 # ------------------------------------------------------------ an independent integration
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, seeds",
     [("slider", (5,)), ("arm", (21, 1001)), ("biped", (7,)), ("talos", (23,)), ("standin", (1114,))],
@@ -157,6 +158,7 @@ def test_order_of_runge_kutta_without_events() -> None:
     assert measured == pytest.approx(order, abs=0.5)
 
 
+@pytest.mark.slow
 def test_order_of_runge_kutta_with_events() -> None:
     """Of the impulse, over several speeds, as where in its step an event falls is chance."""
     method, order, steps = "rk4", 2, (2.5e-4, 3.125e-5)

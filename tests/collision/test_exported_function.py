@@ -70,6 +70,7 @@ print(float(value), float(by_speed), float(by_mass))
 """
 
 
+@pytest.mark.slow
 def test_an_exported_function_is_loaded_and_differentiated_by_another_process(tmp_path):
     library = model().export(tmp_path, ("impulse", "duration"), parameters=("target_mass",))
     command = [sys.executable, "-I", "-c", OTHER, str(library)]

@@ -77,6 +77,7 @@ def test_its_effective_mass_is_that_of_the_whole_tree(satellite: Robot) -> None:
         assert float(function(q)) == pytest.approx(1.0 / (n @ np.linalg.solve(inertia, n)), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_blow_moves_its_base_and_total_momentum_stays(satellite: Robot) -> None:
     """Across gravity nothing acts from outside: what the target gets, the robot loses."""
     q, model, data = _posture(satellite, 1), satellite.model, satellite.model.createData()

@@ -44,6 +44,7 @@ def blow(model: Any) -> Any:
     return model.collide(Q, v, holding_torque(model.robot, Q, v), require_separation=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [2e2, 1e4, 1e6])
 @pytest.mark.parametrize("freezes", [0, 1, 2, 4])
 def test_the_error_is_not_more_than_is_said(stiffness: float, freezes: int) -> None:

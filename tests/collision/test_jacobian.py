@@ -214,6 +214,7 @@ def test_other_models_are_refused(options, output, why):
         implicit("arm", **options).jacobian_function((output,))
 
 
+@pytest.mark.slow
 def test_tangents_stay_within_the_bounds_of_their_arrays(tmp_path: Path) -> None:
     """Under the compiler's sanitizer of undefined behaviour, which ends the process."""
     script = (

@@ -256,6 +256,7 @@ def test_each_term_against_an_independent_integration(effects):
     np.testing.assert_allclose(result.configuration, after, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.4, 1.0, 3.0])
 @pytest.mark.parametrize("gain", [20.0, 150.0, 300.0])
 @pytest.mark.parametrize("seed", [2, 3])
@@ -270,6 +271,7 @@ def test_impulse_over_postures_speeds_and_gains(speed, gain, seed):
     assert sdc.collide(q, v, torque, **gains).impulse == pytest.approx(expected["impulse"], rel=1e-7)
 
 
+@pytest.mark.slow
 def test_infinite_torque_limits_are_no_limits():
     robot, sdc = robot_named("talos"), default_sdc("talos")
     q, v, torque = situation(robot, seed=15, speed=2.0)
@@ -284,6 +286,7 @@ def default_sdc(name):
     return make(robot_named(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, stance",
     [
@@ -341,6 +344,7 @@ class SprungMass(Target):
         return 0.5 * (p["mass"] * state[1] ** 2 + p["stiffness"] * state[0] ** 2)
 
 
+@pytest.mark.slow
 def test_a_nonlinear_law_and_target_against_an_independent_integration():
     law = HardeningSpring(stiffness=1e4, hardening=4e8, damping=2e4)
     target = SprungMass(mass=2.0, stiffness=500.0, drag=3.0)
@@ -380,6 +384,7 @@ def test_a_nonlinear_law_and_target_against_an_independent_integration():
 
 
 # ------------------------------------------------------------ balances
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [PAPER, Effects(), ALL], ids=["paper", "default", "all"])
 def test_ground_wrench_is_what_the_robots_momentum_needs(effects):
     """d/dt of the centroidal momentum (Pinocchio) = ground + weight + reaction at the hand, at every step."""

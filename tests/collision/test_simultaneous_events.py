@@ -78,6 +78,7 @@ class Ledge(Target):
         return 0.5 * p["mass"] * state[0] ** 2
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_python")
 @pytest.mark.parametrize("kind", MODELS)
 @pytest.mark.parametrize("speed", [0.5, 2.0])
@@ -133,6 +134,7 @@ def test_a_joint_at_the_edge_of_its_frictions_band(kind, push):
     np.testing.assert_allclose(at(1.0), at(1.0 + NEXT_TO), rtol=SAME)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_python")
 @pytest.mark.parametrize("kind", [SDC, FullDynamics])
 def test_a_hand_that_rests_against_the_target(kind):
@@ -146,6 +148,7 @@ def test_a_hand_that_rests_against_the_target(kind):
         assert outcome(model, speed=0.0, push=push)[0] == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_python")
 @pytest.mark.parametrize("friction", [None, JointFriction(coulomb=8.0, transition=1.0)])
 @pytest.mark.parametrize("target", [FreeMass(mass=1.0), Nail(mass=0.05, resistance=40.0)])
@@ -161,6 +164,7 @@ def test_a_hand_that_rests_in_steps_of_one_length(target, friction, push):
     assert (graph > 0.1) == (push > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [SDC, FullDynamics, MujocoDynamics])
 def test_a_hand_as_fast_as_what_it_meets(kind):
     model = model_of(kind, FreeMass(mass=1.0, initial_velocity=1.0))

@@ -28,6 +28,7 @@ def slider(**options: Any) -> SDC:
     return SDC(robot=small_robots.slider(2.0), striker="tip", normal=X, **settings)
 
 
+@pytest.mark.slow
 def test_random_cases_on_a_slider_and_an_arm_are_right_or_refused() -> None:
     outcomes = [o for rig in (Rig(robot="slider"), Rig(robot="arm", seed=1)) for o in judge_rig(rig, 48)]
     # nothing is proved by refusing everything

@@ -52,6 +52,7 @@ def blow(law: Any, target: Target, speed: float, kind: Any = SDC) -> Any:
     return model.collide([0.0], [speed], *([[0.0]] if kind is not VirtualMass else []))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [SDC, VirtualMass, FullDynamics])
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("target", TARGETS)

@@ -135,6 +135,7 @@ def test_momentum_of_robot_and_target_is_kept_in_three_directions(
     )
 
 
+@pytest.mark.slow
 @FRICTIONS
 def test_frozen_dynamics_come_to_full_dynamics(friction: ContactFriction) -> None:
     model, at = oblique(FullDynamics, contact_friction=friction)
@@ -150,6 +151,7 @@ def test_frozen_dynamics_come_to_full_dynamics(friction: ContactFriction) -> Non
     assert abs(held.collide(*at).impulse / full.impulse - 1) > 1e-3  # and it matters
 
 
+@pytest.mark.slow
 @FRICTIONS
 def test_mujoco_agrees(friction: ContactFriction) -> None:
     robot = arm()
@@ -260,6 +262,7 @@ def test_programs_have_the_derivatives_of_differences(friction: ContactFriction)
     check_derivatives(t.program, x + 0.01 * np.random.default_rng(1).standard_normal(len(x)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "friction", [MOVES, ContactFriction(coefficient=0.4, stiffness=8e3, moves_target=True)]
 )
@@ -299,6 +302,7 @@ def test_a_plan_is_what_both_engines_replay(friction: ContactFriction) -> None:
     assert "tangential_speed_m_s" not in done.outcome and not done.target_aside.size
 
 
+@pytest.mark.slow
 def test_plans_follow_the_targets_mass() -> None:
     """Which is in the equations of motion, by its velocity across the normal."""
     problem = dataclasses.replace(arm_problem(), friction=MOVES, terms=(*BODILESS, Incidence(speed=0.5)))

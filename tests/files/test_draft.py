@@ -145,6 +145,7 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
             _drafted(tmp_path, text, motion=motion)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["punch", "nail"])
 def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path, motion: str) -> None:
     text = urdfs.arm()
@@ -168,6 +169,7 @@ def test_a_hand_waits_ahead_of_its_shoulder_wherever_on_its_axis_a_joint_is_give
     assert there[0][1] < -0.15 and there[1] == pytest.approx(there[0], abs=0.02)
 
 
+@pytest.mark.slow
 def test_an_elbow_that_drives_no_nail_is_told_why_its_strikes_fail(tmp_path: Path) -> None:
     """A posture in front, which its one joint has not either, is not what it lacks."""
     parts = [
@@ -181,6 +183,7 @@ def test_an_elbow_that_drives_no_nail_is_told_why_its_strikes_fail(tmp_path: Pat
     assert optimize_strike(_problem(tmp_path, elbow)).status.usable
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "motion", "kind"),
     [(urdfs.arm(), "nail", Nail), (urdfs.biped(), "chop", Board)],
@@ -238,6 +241,7 @@ def test_weak_ankles_carry_the_start_posture(tmp_path: Path) -> None:
     assert 0.0 < ahead[1] < 0.025 < ahead[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text", [urdfs.biped(), urdfs.arm(), urdfs.arm(wheels=True)], ids=["biped", "arm", "cart"]
 )
@@ -389,6 +393,7 @@ def test_a_striker_is_at_the_end_of_its_link(tmp_path: Path) -> None:
     assert striker["frame"] == "wrist_link" and striker["point_m"] == [0.0, 0.0, 0.15]  # the claws' tips
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ball", [0.04, 0.2])
 def test_of_a_forearm_with_a_ball_for_a_collision_shape_the_drawn_end_strikes(
     tmp_path: Path, ball: float
@@ -413,6 +418,7 @@ def _strike(problem: ImpactProblem) -> float:
     return solved.impulse if solved.status.usable else 0.0
 
 
+@pytest.mark.slow
 def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At least 0.8 of the best of 20 strikes elsewhere, at points and normals that are drawn here."""
     monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
@@ -456,6 +462,7 @@ def _two_arms() -> str:
     return urdfs.robot("two arms", *parts)
 
 
+@pytest.mark.slow
 def test_a_target_does_not_fly_into_the_base(tmp_path: Path) -> None:
     """A wide plate below the arm: what is hit down lands on it within the follow-through."""
     plate = urdfs.link("base", 10.0, (2.4, 2.4, 0.1), (0.0, 0.0, 0.25))
@@ -464,6 +471,7 @@ def test_a_target_does_not_fly_into_the_base(tmp_path: Path) -> None:
     assert problem.normal[2] == 0 and not hopeless(problem)
 
 
+@pytest.mark.slow
 def test_a_telescope_that_reaches_to_a_side_strikes_there(tmp_path: Path) -> None:
     """Its slides are shorter than a usual run-up, and nothing is within reach ahead of its base."""
     slide = {"kind": "prismatic", "effort": 100.0, "velocity": 1.0}
@@ -487,6 +495,7 @@ def test_a_telescope_that_reaches_to_a_side_strikes_there(tmp_path: Path) -> Non
     assert hopeless(problem) == [] and problem.point[1] < -0.3
 
 
+@pytest.mark.slow
 def test_of_two_arms_the_other_one_waits_where_its_motors_hold_it(tmp_path: Path) -> None:
     draft = _drafted(tmp_path, _two_arms(), planned=True)
     said = next(line for line in draft.said if "that have a whole motion" in line)
@@ -505,6 +514,7 @@ def test_of_two_arms_the_other_one_waits_where_its_motors_hold_it(tmp_path: Path
     assert float(said.split()[-3]) == pytest.approx(solution.impulse, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("still", [("turn", "wrist"), ("wrist",)])
 def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) -> None:
     """It cannot turn its hand at will: with the hand's face, or else with what comes first."""
@@ -517,6 +527,7 @@ def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) ->
     assert off == any("first_touch" in line for line in draft.said)
 
 
+@pytest.mark.slow
 def test_a_weak_blow_is_told_as_such(tmp_path: Path) -> None:
     problem = _problem(tmp_path, urdfs.arm())
     strong = best_share(problem)
@@ -527,6 +538,7 @@ def test_a_weak_blow_is_told_as_such(tmp_path: Path) -> None:
     assert f"{100 * strong[0]:.0f} % of the hardest impact nearby" in done.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity", [0.3, 4.0])
 def test_phases_last_as_long_as_slow_joints_need(tmp_path: Path, velocity: float) -> None:
     problem = _problem(tmp_path, urdfs.arm(velocity=velocity))
@@ -592,6 +604,7 @@ def test_of_a_tool_at_the_joint_itself_a_long_hand_strikes(tmp_path: Path) -> No
     assert axis == pytest.approx([1.0, 0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_where_no_plan_is_found_motions_may_last_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -603,6 +616,7 @@ def test_where_no_plan_is_found_motions_may_last_longer(
     assert solve(problem).status.usable
 
 
+@pytest.mark.slow
 def test_a_flange_that_the_wrist_hides_gets_a_peg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As of some makers' arms: with nothing mounted the link before would touch the target first."""
     monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
@@ -628,6 +642,7 @@ def test_links_without_mass_are_told(tmp_path: Path) -> None:
         _drafted(tmp_path, text)
 
 
+@pytest.mark.slow
 def test_a_shape_larger_than_the_robot_is_told_and_no_body(tmp_path: Path) -> None:
     """As of a mesh in millimetres; where the robot is plausible nothing is left out."""
     text = urdfs.arm().replace('<box size="0.08 0.08 0.3"/>', '<box size="80 80 300"/>')
@@ -641,6 +656,7 @@ def test_a_shape_larger_than_the_robot_is_told_and_no_body(tmp_path: Path) -> No
     assert not any(piece.assumed for piece in bodies_of(_problem(tmp_path, urdfs.arm()).robot).pieces)
 
 
+@pytest.mark.slow
 def test_a_shape_far_from_its_link_is_told_and_does_not_strike(tmp_path: Path) -> None:
     text = urdfs.arm().replace(
         '<collision><origin xyz="0.0 0.0 0.05"/><geometry><box size="0.08 0.08 0.1"/>',
@@ -654,6 +670,7 @@ def test_a_shape_far_from_its_link_is_told_and_does_not_strike(tmp_path: Path) -
     assert abs(point[1]) < 0.05 and point[2] > 0.05
 
 
+@pytest.mark.slow
 def test_what_the_file_lacks_is_guessed_and_said_to_be(tmp_path: Path) -> None:
     draft = _drafted(tmp_path, urdfs.arm(effort=0.0, velocity=0.0))
     keys = read_toml(draft.text)["robot"]
@@ -684,6 +701,7 @@ def test_a_limit_that_no_motor_has_is_none(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(drafted.robot, key), getattr(plain.robot, key))
 
 
+@pytest.mark.slow
 def test_joints_of_a_file_without_ranges_get_some(tmp_path: Path) -> None:
     """As of onshape-to-robot's; beside joints with a range, one without is that of a loop, and fixed."""
     arm = urdfs.arm()
@@ -806,6 +824,7 @@ def test_a_drawing_of_lines_has_no_soles(tmp_path: Path) -> None:
         _drafted(tmp_path, text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("effort", "locked"), [(20.0, True), (2000.0, False)])
 def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: float, locked: bool) -> None:
     """Makers' files have such limits where nobody looked."""
@@ -896,6 +915,7 @@ def test_legs_with_a_weightless_finger_are_not_bolted_silently(tmp_path: Path) -
         draft_robot(path, mjcf=True)
 
 
+@pytest.mark.slow
 def test_a_joint_may_have_a_links_name(tmp_path: Path) -> None:
     same = urdfs.arm().replace('joint name="elbow"', 'joint name="elbow_link"')
     same = same.replace('joint name="slide_0"', 'joint name="claw_0"')
@@ -935,6 +955,7 @@ def test_the_root_of_a_walker_needs_one(tmp_path: Path) -> None:
         Robot.from_urdf(tmp_path / "robot.urdf")
 
 
+@pytest.mark.slow
 def test_a_follower_on_an_arm_follows(tmp_path: Path) -> None:
     text = urdfs.following(urdfs.arm(effort=0.0), "elbow", 'joint="shoulder" multiplier="-0.5" offset="0.1"')
     draft = _drafted(tmp_path, text)
@@ -960,6 +981,7 @@ def test_hips_that_share_a_motor_are_locked_straight(tmp_path: Path) -> None:
     assert [sole.hinge is not None for sole in problem.robot.soles] == [True, True]  # legs of five joints
 
 
+@pytest.mark.slow
 def test_a_follower_that_cannot_follow_is_locked_where_its_leader_is_bent(tmp_path: Path) -> None:
     text = urdfs.following(urdfs.arm(), "shoulder", 'joint="elbow" multiplier="-0.5" offset="0.1"')
     text = text.replace('name="shoulder" type="revolute"', 'name="shoulder" type="continuous"')
@@ -987,6 +1009,7 @@ def test_followers_of_their_own_leg_follow(tmp_path: Path) -> None:
     assert all(len(leg.joints) == 6 and not len(leg.before) for leg in problem.coordinates.legs)
 
 
+@pytest.mark.slow
 def test_meshes_that_are_no_bodies_are_told(tmp_path: Path) -> None:
     lost = (
         ('"0.08 0.08 0.3"/>', '<mesh filename="cut.stl"/>'),
@@ -1010,6 +1033,7 @@ def test_crossed_limits_are_a_mistake(tmp_path: Path) -> None:
         _drafted(tmp_path, text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", ["0 1 0", "0.3 1 0.2"])
 def test_one_joint_strikes_along_its_circle(tmp_path: Path, axis: str) -> None:
     bar = urdfs.link("bar", 2.0, (0.05, 0.05, 0.5), (0, 0, 0.25))
@@ -1036,6 +1060,7 @@ def _walker(folder: Path) -> Path:
     return xml
 
 
+@pytest.mark.slow
 def test_a_walker_whose_roots_frame_lies_is_drafted_upright(tmp_path: Path) -> None:
     xml = _walker(tmp_path)
     (tmp_path / "upright.toml").write_text(draft_problem(xml, folder=tmp_path, mjcf=True).text)
@@ -1091,6 +1116,7 @@ def test_robots_of_example_robot_data_go_by_name() -> None:
         find_description("gone.urdf")
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_file_once(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(urdfs.arm())
     out = tmp_path / "my arm.toml"
@@ -1108,6 +1134,7 @@ def test_the_command_writes_a_file_once(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, ["new", "punch", "--urdf", "x"]).exit_code == 2
 
 
+@pytest.mark.slow
 def test_a_robots_file_in_place_of_a_name_is_drafted_for(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(urdfs.arm())
     done = CliRunner().invoke(app, ["new", str(tmp_path / "arm.urdf"), "--json"])

@@ -167,6 +167,7 @@ def play(directory: Path, *options: str) -> list[float]:
 
 
 # ---------------------------------------------------------------- an arm
+@pytest.mark.slow
 def test_csv_replays_as_the_plan_does(arm: Solution, tmp_path: Path) -> None:
     files = arm.export("csv", tmp_path / "new" / "csv", joints=["wrist", "shoulder", "elbow"])
     assert [path.name for path in files] == ["meta.json", "motion.csv"] and all(p.is_file() for p in files)
@@ -219,6 +220,7 @@ def test_rates_are_those_of_the_curve(arm: Solution, tmp_path: Path, which: str)
     np.testing.assert_allclose(found, rate[even], atol={"position": 1e-5, "velocity": 0.05}[which])
 
 
+@pytest.mark.slow
 def test_ros2_is_a_goal_that_replays_as_the_plan_does(arm: Solution, tmp_path: Path) -> None:
     _, path = arm.export("ros2", tmp_path / "goal")
     goal = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -257,6 +259,7 @@ def test_effort_without_gravity_is_for_arms_that_hold_themselves(
         arm.export("mujoco", tmp_path / "scene", gravity=False)
 
 
+@pytest.mark.slow
 def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
     arm: Solution, planned: Planned, still: Solution, tmp_path: Path
 ) -> None:
@@ -336,6 +339,7 @@ def test_a_smoothed_motion_ends_at_rest_at_any_rate(arm: Solution, tmp_path: Pat
         np.testing.assert_allclose(table(columns, what)[1][-1], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_mcap_is_what_ros_reads(arm: Solution, tmp_path: Path) -> None:
     _, path = arm.export("mcap", tmp_path / "bag")
     messages = read_mcap(path)
@@ -399,6 +403,7 @@ def test_an_impact_without_duration_is_one_jump(still: Solution, tmp_path: Path)
     assert np.isfinite(table(columns, "zmp")[1]).all()
 
 
+@pytest.mark.slow
 def test_mujoco_plays_the_scene(arm: Solution, tmp_path: Path) -> None:
     directory = tmp_path / "scene"
     arm.export("mujoco", directory, joints=["elbow", "wrist", "shoulder"])
@@ -419,6 +424,7 @@ def test_mujoco_plays_the_scene(arm: Solution, tmp_path: Path) -> None:
     assert play(directory, "missing")[0] == 0.0
 
 
+@pytest.mark.slow
 def test_a_soft_grip_is_a_spring_in_the_scene_and_the_tables(tmp_path: Path) -> None:
     """What nothing drives is not asked to follow the plan; so the scene's blow is the replay's."""
     firm = load_problem("arm_planar")
@@ -439,6 +445,7 @@ def test_a_soft_grip_is_a_spring_in_the_scene_and_the_tables(tmp_path: Path) -> 
     assert np.any(less["effort_shoulder_N_m"] != table["effort_shoulder_N_m"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "target"),
     [
@@ -574,6 +581,7 @@ def test_mjlab_has_only_the_joints_of_the_robots_file(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- a humanoid
+@pytest.mark.slow
 def test_a_punch_replays_from_csv_and_stands(punch: Solution, tmp_path: Path) -> None:
     files = punch.export("csv", tmp_path / "csv")
     assert [path.name for path in files] == ["meta.json", "missed.csv", "motion.csv"]
@@ -604,6 +612,7 @@ def test_a_punch_replays_from_csv_and_stands(punch: Solution, tmp_path: Path) ->
     assert ((zmp > low) & (zmp < high)).all()
 
 
+@pytest.mark.slow
 def test_a_punch_plays_in_plain_mujoco(punch: Solution, tmp_path: Path) -> None:
     punch.export("mujoco", tmp_path / "scene")
     impulse, _, height, planned = play(tmp_path / "scene")
@@ -613,6 +622,7 @@ def test_a_punch_plays_in_plain_mujoco(punch: Solution, tmp_path: Path) -> None:
     assert impulse == 0.0 and height == pytest.approx(planned, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_punch_for_mjlab_has_the_kinematics_of_mujoco(punch: Solution, tmp_path: Path) -> None:
     punch.export("mjlab", tmp_path / "m", joints=punch.problem.robot.joint_names[::-1])
     motion = check_mjlab(punch, tmp_path / "m" / "motion.npz")

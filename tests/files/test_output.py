@@ -110,6 +110,7 @@ def test_what_is_not_finite_is_null_in_json(problem: ImpactProblem, tmp_path: Pa
     assert read["impulse_Ns"] is None and read["x"] == [None, 3]
 
 
+@pytest.mark.slow
 def test_a_replay_that_misses_the_target_is_kept_with_the_reason(
     problem: ImpactProblem, tmp_path: Path
 ) -> None:
@@ -361,6 +362,7 @@ def test_pictures_of_a_record(record: Record, tmp_path: Path) -> None:
     assert set(tmp_path.iterdir()) == set(written)
 
 
+@pytest.mark.slow
 def test_pictures_need_no_replay_and_stale_ones_go(
     record: Record, problem: ImpactProblem, tmp_path: Path
 ) -> None:

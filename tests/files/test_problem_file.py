@@ -469,6 +469,7 @@ def test_a_kinds_keys_are_its_own(tmp_path: Path, old: str, new: str, parts: lis
         assert part in text, text
 
 
+@pytest.mark.slow
 def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
     rigid = '[collision]\nmodel = "rigid"\ncoefficient_of_restitution = 0.4\n'
     problem = load_problem(write(tmp_path, GOOD + rigid))

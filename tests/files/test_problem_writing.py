@@ -216,6 +216,7 @@ def goes_together(changes: dict[str, Any]) -> bool:
     return not nail or not (isinstance(changes.get("law"), contact.SpringDamper) or peaks)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(changes=CHANGES.filter(goes_together), turn=st.floats(-0.05, 0.05))
 def test_any_problem_comes_back(nailing: ImpactProblem, changes: dict[str, Any], turn: float) -> None:
@@ -401,6 +402,7 @@ def test_solver_settings_are_written(nailing: ImpactProblem) -> None:
     assert parse_problem_file(write_problem(nailing, solver=solver), Path("x.toml")).solver == solver
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", problem_names())
 def test_a_template_is_the_same_problem_with_every_key_shown(name: str) -> None:
     text, problem = problem_template(name), load_problem(name)

@@ -53,6 +53,7 @@ def run(*arguments: object, code: int = 0) -> tuple[str, str]:
     return result.stdout, result.stderr
 
 
+@pytest.mark.slow
 def test_json_is_the_flat_report(saved: Path, punch: Solution, tmp_path: Path) -> None:
     out, _ = run(saved, "--json", "--out", tmp_path / "new" / "place", *QUICK)
     report = json.loads(out)
@@ -69,6 +70,7 @@ def test_json_is_the_flat_report(saved: Path, punch: Solution, tmp_path: Path) -
     assert json.loads((tmp_path / "new" / "place" / "replay.json").read_text()) == report
 
 
+@pytest.mark.slow
 def test_held_soles_cannot_say_whether_it_stands(saved: Path) -> None:
     out, _ = run(saved / "solution.npz", "--engine", "pinocchio", "--json", "--step", "5e-4")
     report = json.loads(out)
@@ -76,6 +78,7 @@ def test_held_soles_cannot_say_whether_it_stands(saved: Path) -> None:
     assert abs(report["impulse_error_pct"]) < 2
 
 
+@pytest.mark.slow
 def test_a_missed_blow_is_replayed_on_held_soles_too(saved: Path) -> None:
     out, _ = run(saved, "--engine", "pinocchio", "--missing", "--json", "--step", "5e-4")
     report = json.loads(out)
@@ -85,6 +88,7 @@ def test_a_missed_blow_is_replayed_on_held_soles_too(saved: Path) -> None:
     assert report["torque_ratio"] < 1.05 and report["zmp_margin_m"] > 0
 
 
+@pytest.mark.slow
 def test_an_unsolved_plan_and_a_blow_that_does_not_hit_are_said(hammered: Solution, tmp_path: Path) -> None:
     record = record_of(hammered, problem=problem_file("arm_planar").read_text("utf-8"))
     save_record(record, tmp_path)
@@ -95,6 +99,7 @@ def test_an_unsolved_plan_and_a_blow_that_does_not_hit_are_said(hammered: Soluti
     assert out.splitlines()[-2:] == ["Stopped at the time limit.", "the target is not hit"]
 
 
+@pytest.mark.slow
 def test_a_fall_exits_1_and_says_when(saved: Path) -> None:
     out, _ = run(saved, "--payload", 30, "--missing", "--step", "1e-3", code=1)
     assert "stands at the end" in out and "! no" in out
@@ -161,6 +166,7 @@ def test_a_result_without_a_motion_has_nothing_to_replay(tmp_path: Path) -> None
         load_planned(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_links_hull_is_told_beside_the_striking_point(hammered: Solution) -> None:
     planned = Planned(record=record_of(hammered), problem=hammered.problem, reference=hammered.trajectory)
     report = replay(planned, contact="link").report
@@ -203,6 +209,7 @@ def test_the_animation_draws_the_world_where_the_replay_has_it(still: Replay) ->
     assert _Drawing(gone).look(0).world == []
 
 
+@pytest.mark.slow
 def test_the_animation_is_a_gif_with_every_instant(still: Replay, tmp_path: Path) -> None:
     sim = still.simulation
     assert sim.contact_start == 0 and still.report["hand_speed_m_s"] is not None
@@ -219,6 +226,7 @@ def test_the_animation_is_a_gif_with_every_instant(still: Replay, tmp_path: Path
     assert path.stat().st_size < 1_000_000
 
 
+@pytest.mark.slow
 def test_a_robot_without_soles_is_drawn_from_above(hammered: Solution) -> None:
     planned = Planned(record=record_of(hammered), problem=hammered.problem, reference=hammered.trajectory)
     drawing = _Drawing(replay(planned))

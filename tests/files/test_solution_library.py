@@ -71,6 +71,7 @@ def test_what_is_far_or_of_another_kind_is_none(folder: SolvedFolder, settings: 
     assert folder.nearest(arm(**settings)) is None
 
 
+@pytest.mark.slow
 def test_a_start_from_a_neighbour_is_quicker(folder: SolvedFolder) -> None:
     file = arm(target__mass_kg=0.055)
     problem = file.build()
@@ -91,6 +92,7 @@ def test_a_damaged_neighbour_is_no_start(folder: SolvedFolder) -> None:
         folder.solve(arm().build(), arm(), starts=2)
 
 
+@pytest.mark.slow
 def test_cases_of_a_sweep_start_from_each_other(tmp_path: Path) -> None:
     chosen = sweep_from_data(
         {
@@ -126,6 +128,7 @@ def test_sweeps_without_neighbours_say_so(other: dict[str, Any]) -> None:
         )
 
 
+@pytest.mark.slow
 def test_solve_keeps_and_finds_plans(tmp_path: Path) -> None:
     options = ["--store", str(tmp_path / "store"), "--no-validate", "--out", str(tmp_path / "out")]
     runner = CliRunner()
@@ -136,6 +139,7 @@ def test_solve_keeps_and_finds_plans(tmp_path: Path) -> None:
     assert len(list((tmp_path / "store").iterdir())) == 2
 
 
+@pytest.mark.slow
 def test_a_saved_result_is_a_solution_again(folder: SolvedFolder, solution: Solution, tmp_path: Path) -> None:
     again, price = load_solution(folder.path / "plain"), "terms.torque_limit.collision"
     assert again.status is solution.status and again.impulse == pytest.approx(solution.impulse, rel=1e-12)

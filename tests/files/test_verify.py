@@ -83,6 +83,7 @@ def test_a_result_is_verified(record: Record, tmp_path: Path) -> None:
     assert set(found["rows"]["contact law"]) == {"violation", "where"}
 
 
+@pytest.mark.slow
 def test_drives_and_grips_are_verified(soft_record: Record, tmp_path: Path) -> None:
     save_record(soft_record, tmp_path)
     found = verified(tmp_path, code=0)
@@ -90,6 +91,7 @@ def test_drives_and_grips_are_verified(soft_record: Record, tmp_path: Path) -> N
     assert {"gear load", "spring of a joint", "effort of a node"} <= found["rows"].keys()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "word"),
     [
@@ -134,6 +136,7 @@ def emptied(name: str) -> Callable[[dict[str, Any]], None]:
     return change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "word"),
     [
@@ -164,6 +167,7 @@ def test_a_number_of_the_summary_is_not_believed(record: Record, tmp_path: Path,
     assert f"summary, {key}" in verified(tmp_path, code=1)["reason"]
 
 
+@pytest.mark.slow
 def test_the_summary_beside_is_the_one_inside(record: Record, tmp_path: Path) -> None:
     save_record(record, tmp_path)
     path = tmp_path / "summary.json"
@@ -198,6 +202,7 @@ def test_a_result_of_another_program_is_said(record: Record, tmp_path: Path) -> 
     assert load_record(tmp_path).problem == text
 
 
+@pytest.mark.slow
 def test_a_plan_by_a_model_that_is_frozen_on_the_way_is_verified(tmp_path: Path) -> None:
     text = ARM.read_text("utf-8") + '\n[collision]\nmodel = "sdc"\nfreezes = 2\n'
     (tmp_path / "frozen.toml").write_text(text, "utf-8")

@@ -80,6 +80,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_result(tmp_path_factory.mktemp("made"))
 
 
+@pytest.mark.slow
 def test_commands_with_something_wrong(tmp_path: Path, result: Path) -> None:
     found = [attack.case("command", SEED, k, folder=tmp_path, result=result) for k in range(16)]
     assert not faults(found)
@@ -224,6 +225,7 @@ def test_a_swing_that_the_hands_speed_does_not_show_is_followed_too(name: str) -
     assert found.impulse == pytest.approx(truth(model, blow).impulse, rel=accuracy)
 
 
+@pytest.mark.slow
 def test_a_row_whose_steps_are_used_up_has_no_number_as_alone() -> None:
     # found by this seed: a nail that rattles; alone it is refused
     found = strike("arm7", "spring-damper", "nail", 10, 405)
@@ -245,6 +247,7 @@ def test_collisions_are_the_same_with_and_without_a_compiler(monkeypatch: pytest
     assert "IMPACTOPT_NO_COMPILER" not in os.environ
 
 
+@pytest.mark.slow
 def test_replays_are_those_of_an_equation_of_their_own(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     impulses: list[Any] = []
 

@@ -64,6 +64,7 @@ def test_two_free_masses_collide_as_their_reduced_mass() -> None:
     np.testing.assert_allclose(history.time[-1], whole.duration, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", TRUE)
 def test_numbers_come_out_of_a_log_with_noise(law: str) -> None:
     found = identify(log_of(TrueBlow(law, mass=MASS), seed=3))
@@ -85,6 +86,7 @@ def test_without_noise_numbers_are_exact(law: str) -> None:
     assert found.speeds[0].value == pytest.approx(1.0, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_intervals_of_95_percent_are_such() -> None:
     """Errors over standard errors have a deviation of one, within three of their own for so many draws."""
     blow, draws = TrueBlow("spring damper", mass=MASS), 36
@@ -111,6 +113,7 @@ def test_contact_may_fill_most_of_a_log() -> None:
         assert found.estimates[name].value == pytest.approx(value, rel=0.05), name
 
 
+@pytest.mark.slow
 def test_several_blows_share_law_and_mass_and_leave_a_free_target() -> None:
     blows = [TrueBlow("Hunt-Crossley", mass=MASS, speed=v, target_mass=2.0) for v in (0.5, 1.0, 1.5)]
     found = identify(log_of(*blows, seed=1), laws=[HuntCrossley], target_mass=2.0).best
@@ -389,6 +392,7 @@ def test_contacts_that_are_too_weak_to_be_fitted_are_told() -> None:
 
 
 # ---------------------------------------------------------------- command
+@pytest.mark.slow
 def test_the_command_prints_numbers_and_writes_a_section(tmp_path: Path) -> None:
     log, path, out = log_of(TrueBlow("Hunt-Crossley"), seed=3), tmp_path / "blow.csv", tmp_path / "law.toml"
     columns = np.column_stack([log.time, log.force, log.speed])

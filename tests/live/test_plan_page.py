@@ -72,6 +72,7 @@ def saved(arm: Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ---- controls
 
 
+@pytest.mark.slow
 def test_a_standing_robots_answer_has_the_impulse_of_its_optimum() -> None:
     """Looser tolerances leave the barrier on: its many bounds must not take a visible part of the impulse."""
     biped = solve(biped_problem(), refine=False)
@@ -84,6 +85,7 @@ def test_a_standing_robots_answer_has_the_impulse_of_its_optimum() -> None:
     assert answer.solution.impulse == pytest.approx(optimum.impulse, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_slider_makes_a_new_plan(look: PlanPage, arm: Solution) -> None:
     mass = 1.2 * arm.problem.target.mass
     look.sliders["mass"].value = mass
@@ -110,6 +112,7 @@ def test_a_dragged_hit_point_is_hit_where_it_is(look: PlanPage, arm: Solution) -
     assert hand[0] == pytest.approx(point[0], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_hit_leaves_the_old_plan_and_says_why(look: PlanPage, arm: Solution) -> None:
     look.hit.position = arm.problem.point + np.array([0.0, 0.5, 0.0])  # out of the arm's plane
     look.changed()
@@ -316,6 +319,7 @@ SLIDE = """(() => {
 })()"""
 
 
+@pytest.mark.slow
 def test_the_page_opens_in_a_browser_and_its_slider_plans(look: PlanPage, arm: Solution) -> None:
     first = f"{arm.result.iterations} iterations"
     there = f"(document.body?.innerText ?? '').includes({first!r})"
@@ -331,6 +335,7 @@ def test_the_page_opens_in_a_browser_and_its_slider_plans(look: PlanPage, arm: S
     assert look.answer.solution.problem.target.mass == pytest.approx(float(seen.values[1]))
 
 
+@pytest.mark.slow
 def test_the_command_serves_until_ctrl_c(saved: Path) -> None:
     command = [sys.executable, "-m", "impactopt", "show", str(saved), "--live"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

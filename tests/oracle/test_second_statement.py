@@ -159,6 +159,7 @@ def test_of_a_ball_that_comes_and_is_caught() -> None:
 ENDS = {"C": "end of compression", "S": "separation", "T": "touch", "B": "break"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "touches"),
     [
@@ -283,6 +284,7 @@ def test_of_an_objective_that_is_not_linear(objective: Objective) -> None:
     check_rows(transcribed(dataclasses.replace(p, objectives=(*p.objectives, objective))))
 
 
+@pytest.mark.slow
 def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned) -> None:
     """By the wrenches that the legs' torques leave to the soles, as the plan says."""
     plan, t = biped_plan.plan, biped_plan.transcription
@@ -299,6 +301,7 @@ def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned)
         assert off["reference normal force of a sole"] < 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("blow", "count"), [(1, 3), (2, 3), (1, 2)], ids=["on one foot", "after a step", "ends on one foot"]
 )

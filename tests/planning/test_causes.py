@@ -58,6 +58,7 @@ def changes(arm: ImpactProblem) -> dict[str, tuple[ImpactProblem, str]]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hard wood", "short swing", "long swing", "soft contact"])
 def test_the_bound_that_is_named_is_the_one_that_has_to_move(arm: ImpactProblem, name: str) -> None:
     problem, first = changes(arm)[name]
@@ -104,6 +105,7 @@ def test_clearances_that_are_too_many_together_are_named(arm: ImpactProblem) -> 
     assert with_reason(t, result, found.causes).message.startswith("Infeasible: keep out. wrist and shelf")
 
 
+@pytest.mark.slow
 def test_no_less_would_do(arm: ImpactProblem) -> None:
     """The swing of the message is the shortest there is, within a few per cent."""
     problem = load_problem("punch_infeasible")
@@ -127,6 +129,7 @@ def test_the_robots_own_weight(arm: ImpactProblem) -> None:
         assert bool(text) == bool(told)
 
 
+@pytest.mark.slow
 def test_a_window_that_takes_nearly_all_is_told(arm: ImpactProblem) -> None:
     """Half a period of 1 kg on 1e3 N/m takes 99 ms: in 15 ms a phase there is no blow worth its name."""
     law = dataclasses.replace(arm.law, stiffness=1e3, damping=0.0)
@@ -156,6 +159,7 @@ def handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.usefixtures("handlers")
 def test_a_signal_between_two_solves_keeps_the_plan(arm: ImpactProblem, number: signal.Signals) -> None:

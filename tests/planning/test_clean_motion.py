@@ -14,6 +14,7 @@ from impactopt import Solution, load_problem, solve
 from impactopt.files.output import record_of
 
 
+@pytest.mark.slow
 def test_no_mesh_is_in_another_from_start_to_rest_or_after_a_miss(punch: Solution) -> None:
     assert punch.status.usable, punch.result.message
     meshes = Meshes(punch.problem.robot, punch.problem.start_posture)
@@ -31,6 +32,7 @@ def test_the_meshes_know_what_is_in_each_other(punch: Solution) -> None:
     assert any("arm_left" in one or "arm_left" in two for one, two in meshes.touching(q[None]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aside", [(0.017, 0.004, 0.009), (-0.005, 0.02, 0.019)])
 def test_nor_when_it_is_bent(punch: Solution, aside: tuple[float, float, float]) -> None:
     """So far that other bodies come near than those that the plan has rows for."""
@@ -39,6 +41,7 @@ def test_nor_when_it_is_bent(punch: Solution, aside: tuple[float, float, float])
     assert Meshes(bent.problem.robot, bent.problem.start_posture).touching(bent.plan.motion().q) == []
 
 
+@pytest.mark.slow
 def test_nor_in_another_problem() -> None:
     """All of them: `python -m benchmarks truth`."""
     solution = solve(load_problem("chop"))
@@ -55,6 +58,7 @@ def test_the_summary_says_so(punch: Solution) -> None:
     assert np.isfinite(said["clearance_mm"]) and len(punch.clearance_constraints) > 0
 
 
+@pytest.mark.slow
 def test_bodies_that_pass_through_each_other_are_told(punch: Solution) -> None:
     """The plan with its left arm turned through leg and pelvis: the meshes find the same links there."""
     c, plan = punch.problem.coordinates, punch.plan
@@ -71,6 +75,7 @@ def test_bodies_that_pass_through_each_other_are_told(punch: Solution) -> None:
     assert told <= {frozenset(name.removesuffix("_0") for name in pair) for pair in found}
 
 
+@pytest.mark.slow
 def test_bodies_that_stay_apart_have_no_distance(hammered: Solution) -> None:
     none = {"clearance_mm": None, "nearest": "", "contacts_besides": []}
     assert hammered.clearance() == none

@@ -79,6 +79,7 @@ def test_bodies_that_are_near_at_the_start_may_not_penetrate_more_than_their_rou
     assert gap < 0 and gap - distance < required < gap
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.35, 0.5, 0.65])
 def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share: float) -> None:
     """Pegs in the hammer's way, between any two nodes of the swing: near ones, and such as it passes by with
@@ -106,6 +107,7 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
     assert looked > 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interval", "warm"), [(9, True), (10, False)], ids=["warm", "from its solution"])
 def test_rounds_end_with_bodies_that_are_apart(
     free: Solution, interval: int, warm: bool, monkeypatch: pytest.MonkeyPatch

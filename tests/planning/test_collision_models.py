@@ -144,6 +144,7 @@ def test_the_servo_keeps_its_torque_in_contact(model: str) -> None:
     np.testing.assert_allclose(reference.torque[k], coasting, atol=1e-9 * np.abs(coasting).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "model", "freezes"),
     [
@@ -177,6 +178,7 @@ def test_scenarios_are_frozen_too() -> None:
     assert abs(other.impulse / strike.impulse - 1) > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "step"), [("sdc-paper", 2e-5), ("sdc", 1e-4)])
 def test_weight_and_legs(model: str, step: float) -> None:
     """The small biped's ZMP: its wrenches have the weight that the paper's model leaves out; frozen at
@@ -193,6 +195,7 @@ def test_weight_and_legs(model: str, step: float) -> None:
 RUNS = {"solve": solve, "strike": optimize_strike}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
 def test_auto_takes_what_is_good_enough(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = dataclasses.replace(load_problem("arm_planar"), collision="auto")
@@ -256,6 +259,7 @@ def test_a_warm_start_of_another_model_has_a_contact(
     assert new.impulse(x) > 0.1
 
 
+@pytest.mark.slow
 def test_a_solution_with_friction_starts_one_without() -> None:
     friction = ContactFriction(coefficient=0.3, stiffness=1e5)  # bristles are variables of the program
     problem = dataclasses.replace(arm_problem(), friction=friction)
@@ -306,6 +310,7 @@ def test_one_word_list() -> None:
     assert all(name in alone for name in (*FROZEN, "full"))
 
 
+@pytest.mark.slow
 def test_a_file_says_it_and_a_result_too() -> None:
     runner, extra = CliRunner(), ["--json", "-q", "--starts", "1"]
     given = ["--set", 'collision.model="sdc"', "--set", "collision.freezes=2"]

@@ -108,6 +108,7 @@ def thrown() -> Solution:
     return solve(load_problem("space_arm"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_replays_agree_with_the_plan(thrown: Solution, engine: str) -> None:
     assert thrown.status is Status.SOLVED, thrown.result.message
@@ -160,6 +161,7 @@ def test_its_record_is_verified(thrown: Solution, tmp_path: Path) -> None:
     assert verdict.ok, verdict.reason
 
 
+@pytest.mark.slow
 def test_its_program_written_down_a_second_time_agrees(thrown: Solution) -> None:
     record = record_of(thrown)
     verdict = verify_record(thrown.problem, record.arrays, record.summary)
@@ -170,6 +172,7 @@ def test_its_program_written_down_a_second_time_agrees(thrown: Solution) -> None
     assert not wrong.ok and "reference posture" in wrong.reason
 
 
+@pytest.mark.slow
 def test_two_bodies_strike_as_hard_as_the_closed_form_says() -> None:
     solution = solve(pushing(two_bodies([0.0, 0.0, 0.0])))
     assert solution.status is Status.SOLVED, solution.result.message
@@ -179,6 +182,7 @@ def test_two_bodies_strike_as_hard_as_the_closed_form_says() -> None:
         assert solution.validate(engine=engine).impulse == pytest.approx(solution.impulse, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_robot_in_flight_falls_to_the_target() -> None:
     """The time of the blow is that of a fall, whatever the slider does, and it strikes as hard as without."""
     drop = 0.2

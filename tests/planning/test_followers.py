@@ -76,6 +76,7 @@ def saved(folder: Path, plan: Solution) -> Path:
     return folder / "result"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_engines_replay_the_plan(plan: Solution, engine: str) -> None:
     assert plan.status is Status.SOLVED
@@ -120,6 +121,7 @@ def test_another_law_is_found(plan: Solution, folder: Path) -> None:
     assert CliRunner().invoke(app, ["verify", str(there / "result")]).exit_code != 0
 
 
+@pytest.mark.slow
 def test_exports_command_leaders_and_tell_followers(saved: Path, tmp_path: Path) -> None:
     law = {"name": "wrist", "joint": "elbow", "multiplier": RATIO, "offset": OFFSET}
     for word in ("csv", "ros2", "mcap", "mujoco"):
@@ -133,6 +135,7 @@ def test_exports_command_leaders_and_tell_followers(saved: Path, tmp_path: Path)
     assert result.exit_code == 2 and "'wrist'" in result.output
 
 
+@pytest.mark.slow
 def test_the_exported_scene_plays_the_plan(saved: Path, plan: Solution, tmp_path: Path) -> None:
     mujoco = pytest.importorskip("mujoco")
     out = tmp_path / "scene"

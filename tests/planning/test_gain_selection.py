@@ -114,6 +114,7 @@ def _program(problem: ImpactProblem) -> Transcription:
     return Transcription(problem, c, block_functions(problem, c))
 
 
+@pytest.mark.slow
 def test_no_other_stiffness_is_better(chosen: Solution) -> None:
     """Inside the bounds, so that the worth is level there: it falls each way, by the square of the way."""
     (own,) = chosen.gains
@@ -132,6 +133,7 @@ def test_it_brings_more_than_the_stiffness_that_is_given(chosen: Solution) -> No
     assert _worth(chosen) > 1.02 * _worth(solve(_soft()))
 
 
+@pytest.mark.slow
 def test_what_comes_after_has_the_gains_that_are_chosen(chosen: Solution) -> None:
     (own,) = chosen.gains
     robot, at = chosen.problem.robot, chosen.problem.robot.joint_index(HAND)
@@ -147,6 +149,7 @@ def test_what_comes_after_has_the_gains_that_are_chosen(chosen: Solution) -> Non
         assert replay.outcome["depth_m"] == pytest.approx(depth, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_file_leaves_gains_open_and_its_result_says_which(tmp_path: Path) -> None:
     text = write_problem(replace(_soft(), gains=_open(HAND)))
     read = parse_problem_file(text, tmp_path / "soft.toml")
@@ -170,6 +173,7 @@ def test_a_file_leaves_gains_open_and_its_result_says_which(tmp_path: Path) -> N
     assert verdict.ok and verdict.kkt < 1e-5
 
 
+@pytest.mark.slow
 def test_gains_of_servos_are_chosen_too() -> None:
     """A strike that may choose is better than the one that it starts from, which may not."""
     arm = load_problem("arm7")
@@ -182,6 +186,7 @@ def test_gains_of_servos_are_chosen_too() -> None:
     np.testing.assert_allclose(free.problem.robot.kd, np.sqrt(found.factor) * arm.robot.kd)
 
 
+@pytest.mark.slow
 def test_two_factors_are_chosen_each_in_its_bounds_and_noisy_starts_draw_them() -> None:
     gains = (*_open("joint_[1-4]", between=(0.5, 2.0)), *_open("joint_[5-7]", between=(0.2, 0.9)))
     arm = replace(load_problem("arm7"), gains=gains)
@@ -198,6 +203,7 @@ def test_two_factors_are_chosen_each_in_its_bounds_and_noisy_starts_draw_them() 
     assert second.joints == tuple(f"joint_{k}" for k in range(5, 8)) and 0.2 <= second.factor <= 0.9
 
 
+@pytest.mark.slow
 def test_a_plan_goes_on_from_one_that_has_chosen(chosen: Solution) -> None:
     """Gains begin where that one has them, with all rows met."""
     problem = with_room_for_gains(replace(_soft(), gains=_open(HAND)))

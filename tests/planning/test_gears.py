@@ -69,6 +69,7 @@ def bounded() -> Solution:
     return solution
 
 
+@pytest.mark.slow
 def test_a_plan_that_goes_beyond_gets_rows_and_goes_on(bounded: Solution) -> None:
     """To the plan that rows from the start lead to."""
     problem = _weak()
@@ -95,6 +96,7 @@ def test_a_gear_far_beyond_sends_it_back_to_the_initial_guess(limit: float, agai
     assert first != pytest.approx(last, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_it_holds_in_replays(bounded: Solution, engine: str) -> None:
     found = bounded.validate(engine=engine)
@@ -107,6 +109,7 @@ def test_a_plan_that_does_not_is_the_one_without_a_bound(hammered: Solution) -> 
     assert not _on_gears(kept.problem) and not kept.summary()["rows_on_demand"]
 
 
+@pytest.mark.slow
 def test_no_blow_within_the_limit_is_told() -> None:
     """Held firmly, the hammer passes the nail's resistance on.
 
@@ -119,6 +122,7 @@ def test_no_blow_within_the_limit_is_told() -> None:
     assert "Without [terms.gear_load] there is a plan, but gear of wrist: 2.01" in found.result.message
 
 
+@pytest.mark.slow
 def test_a_strike_is_bounded_too() -> None:
     free, kept = (optimize_strike(p) for p in (_with(_weak(), OFF), _weak()))
     assert free.strike.loads().gear.max() > 1.03 * LIMIT
@@ -128,6 +132,7 @@ def test_a_strike_is_bounded_too() -> None:
     assert again.impulse == pytest.approx(kept.impulse, rel=1e-4) and _on_gears(again.problem)
 
 
+@pytest.mark.slow
 def test_scenarios_count() -> None:
     """Steel that damps more than the expected one makes a larger force at once."""
     damped = Scenario(name="damped", damping=1.6)
@@ -139,6 +144,7 @@ def test_scenarios_count() -> None:
     assert _on_gears(solve(problem).problem)
 
 
+@pytest.mark.slow
 def test_a_neighbour_goes_on_with_the_rows(bounded: Solution) -> None:
     """And one that gets rows of its own from a plan that has none."""
     nearer = replace(bounded.problem, point=bounded.problem.point - [0.01, 0, 0], terms=_weak().terms)
@@ -149,6 +155,7 @@ def test_a_neighbour_goes_on_with_the_rows(bounded: Solution) -> None:
     assert kept.impulse == pytest.approx(bounded.impulse, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_moved_plan_gets_rows_where_it_needs_them() -> None:
     """A limit just above what the plan asks for, and steel that damps more."""
     problem = _weak(1.02 * 2.01)
@@ -170,6 +177,7 @@ def test_a_saved_plan_is_made_again_with_its_rows(bounded: Solution, tmp_path: P
     np.testing.assert_array_equal(again.result.x, bounded.result.x)
 
 
+@pytest.mark.slow
 def test_what_is_off_is_said(tmp_path: Path) -> None:
     """By `check`, in the result and on the page."""
     runner = CliRunner()
@@ -193,6 +201,7 @@ def test_what_gears_bear_at_most_is_part_of_the_problem() -> None:
     assert with_lazy_constraints(_with(weak, OFF), ["gear_load"]).gear_load == OFF
 
 
+@pytest.mark.slow
 def test_a_replay_that_goes_beyond_is_told(bounded: Solution) -> None:
     """A harder world than the plan's."""
     assert not gear_caution(bounded.problem, [bounded.loads])

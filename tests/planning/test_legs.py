@@ -35,6 +35,7 @@ def solution(request: pytest.FixtureRequest) -> Solution:
     return found
 
 
+@pytest.mark.slow
 def test_the_soles_stay_where_they_are(solution: Solution) -> None:
     p, ref = solution.problem, solution.trajectory
     model, data = p.robot.model, p.robot.model.createData()
@@ -48,6 +49,7 @@ def test_the_soles_stay_where_they_are(solution: Solution) -> None:
             assert np.abs(pin.getFrameAcceleration(model, data, frame).vector).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_it_is_verified() -> None:
     solution = solved("five")
     record = record_of(solution)
@@ -55,6 +57,7 @@ def test_it_is_verified() -> None:
     assert verdict.ok, verdict.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_it_is_true_on_held_and_on_free_soles(solution: Solution, engine: str) -> None:
     if engine == "mujoco":
@@ -64,6 +67,7 @@ def test_it_is_true_on_held_and_on_free_soles(solution: Solution, engine: str) -
     assert replay.standing in (None, True) and replay.slip.max() < 3e-3
 
 
+@pytest.mark.slow
 def test_the_collision_is_that_of_full_dynamics(solution: Solution) -> None:
     p, ref = solution.problem, solution.trajectory
     last = int(np.flatnonzero(ref.phase == 0)[-1])
@@ -98,6 +102,7 @@ def test_hinges_bear_no_torque_and_keep_to_their_range() -> None:
     assert np.abs(wrench[:, [4, 10]]).max() > 5.0
 
 
+@pytest.mark.slow
 def test_feet_that_do_not_turn_bring_the_same_blow() -> None:
     """On free soles, of a robot whose soles are its feet: the plan hardly turns its hinges."""
     pytest.importorskip("mujoco")

@@ -63,6 +63,7 @@ def test_the_profile_is_the_quintic_with_its_ends_and_derivatives() -> None:
         np.testing.assert_allclose(acc[0], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_it_is_inside_the_limits_and_a_little_faster_is_not() -> None:
     problem = reach_of(arm(), "start", "hand", stance=FixedBase())
     found = minimum_jerk_baseline(problem, tolerance=0.05)
@@ -120,6 +121,7 @@ def test_limits_that_do_not_let_it_stand_are_said() -> None:
         minimum_jerk_baseline(problem)
 
 
+@pytest.mark.slow
 def test_a_reach_may_use_the_soles_up_to_their_edges() -> None:
     """A margin that leaves a plan no room leaves a reach as it is."""
     narrow = ContactWrenchCone(margin=0.045, minimum_force=100.0)

@@ -57,6 +57,7 @@ def test_starts_that_end_otherwise_are_followed_by_another(
     assert "alike" not in best.result.message
 
 
+@pytest.mark.slow
 def test_a_limit_of_iterations_is_of_all_programs_of_each_start() -> None:
     """The seventh iterate of this arm lacks a clearance constraint, so that a second program is solved."""
     with pytest.warns(NotSolvedWarning, match="iteration limit"):

@@ -60,6 +60,7 @@ def problem(kind: str) -> ImpactProblem:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ram", "arm"])
 def test_one_joint_strikes_with_all_that_it_has(kind: str) -> None:
     made = problem(kind)

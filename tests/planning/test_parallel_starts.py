@@ -25,6 +25,7 @@ def strike(arm: ImpactProblem) -> StrikeSolution:
     return optimize_strike(arm)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plan", [optimize_strike, solve])
 def test_processes_find_what_one_finds(plan: Any, arm: ImpactProblem) -> None:
     told: list[str] = []

@@ -17,6 +17,7 @@ from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.mesh import NO_MORE, nodes_to_add
 
 
+@pytest.mark.slow
 def test_a_reference_that_goes_too_far_gets_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """And none where the term is switched off."""
     narrow = ReferenceRange(margin=1.935)

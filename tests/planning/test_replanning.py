@@ -45,6 +45,7 @@ def arm() -> Solution:
     return solve(problem, options=TIGHT, refine=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "half"),
     [
@@ -201,6 +202,7 @@ def test_parameters_of_a_law_from_a_formula_change(arm: Solution) -> None:
         moved_problem(problem, damping=1.0)
 
 
+@pytest.mark.slow
 def test_a_program_that_does_not_follow_is_built_anew(arm: Solution) -> None:
     problem = changed(arm.problem, terms=(*arm.problem.terms, _OwnTerm()))
     solution = solve(problem, start=arm, refine=False)

@@ -40,6 +40,7 @@ def _off_at_contact(solution: Solution) -> float:
     return float(np.abs(replay.v[last] - planned).max())
 
 
+@pytest.mark.slow
 def test_its_swing_converges() -> None:
     """With the third power of the intervals' length at least: accelerations are right in the mean."""
     problem = _problem()
@@ -51,6 +52,7 @@ def test_its_swing_converges() -> None:
     assert fine < 0.01
 
 
+@pytest.mark.slow
 def test_a_blow_through_it_keeps_the_momentum_of_arm_and_hammer(soft: Solution) -> None:
     """M dv = the torques' impulse less that of the contact, joint by joint; gravity is small in 8 ms."""
     plan, robot = soft.plan, soft.problem.robot
@@ -68,6 +70,7 @@ def test_a_blow_through_it_keeps_the_momentum_of_arm_and_hammer(soft: Solution) 
     np.testing.assert_allclose(change, pushed - bias, atol=0.03 * np.abs(soft.impulse * row).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_what_is_planned_happens(soft: Solution, engine: str) -> None:
     replay = soft.validate(engine=engine)
@@ -115,6 +118,7 @@ def _spring(replay: Simulation) -> np.ndarray:
     return np.asarray(made - made[0])
 
 
+@pytest.mark.slow
 def test_a_controller_steers_the_arm_and_leaves_the_spring_alone(soft: Solution) -> None:
     exact = ControllerSettings(noise=0.0, delay=0.0)
     replay = soft.validate(engine="mujoco", controller=exact)

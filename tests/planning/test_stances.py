@@ -94,6 +94,7 @@ def test_a_duration_that_would_have_to_be_longer_is_that_of_its_phase(program: T
     assert cause.problem.stances[1:] == program.problem.stances[1:]
 
 
+@pytest.mark.slow
 def test_a_step_without_the_time_for_it_names_its_phase() -> None:
     """The search has to lengthen stance phases, too: with 0.2 s the foot does not come 6 cm ahead."""
     step = StancePhase(soles=("left",), phase=Phase(duration=0.2, intervals=6, grading=1.0))
@@ -118,6 +119,7 @@ def test_effort_after_a_stance_phase_has_the_first_node_of_the_swing() -> None:
     assert t.achieved(x)["effort"] == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(program: Transcription) -> None:
     # and of a blow on two feet, after a step on the left one and before one on the right one
     left, right = (dataclasses.replace(BOTH, soles=(name,)) for name in ("left", "right"))
@@ -127,6 +129,7 @@ def test_derivatives_are_those_of_differences(program: Transcription) -> None:
         check_derivatives(t.program, x + 0.01 * np.random.default_rng(1).standard_normal(len(x)))
 
 
+@pytest.mark.slow
 def test_soles_stand_in_their_places_in_their_phases_and_are_in_the_air_between(
     plan: Plan, ways: tuple[Trajectory, Trajectory]
 ) -> None:
@@ -200,6 +203,7 @@ def test_momentum_is_that_of_gravity_and_the_soles_in_every_phase(
             np.testing.assert_allclose(data.dhg.vector, force.vector, atol=1e-9 * mass * 9.81 * 10)
 
 
+@pytest.mark.slow
 def test_a_replay_that_holds_the_soles_by_the_schedule_does_what_is_planned(
     plan: Plan, ways: tuple[Trajectory, Trajectory], held: Simulation
 ) -> None:
@@ -217,6 +221,7 @@ def test_a_replay_that_holds_the_soles_by_the_schedule_does_what_is_planned(
     assert found["follow"] > planned["follow"] - 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", [False, True])
 def test_the_whole_body_controller_follows_the_schedule_on_free_soles(
     plan: Plan, ways: tuple[Trajectory, Trajectory], missing: bool

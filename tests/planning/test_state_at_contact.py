@@ -55,6 +55,7 @@ BEND[:3] = -30.0, 400.0, -5e3
 
 
 # ---------------------------------------------------------------- a reference that bends
+@pytest.mark.slow
 def test_a_servo_on_a_slide_against_scipy() -> None:
     """One mass, whose servo wants to be elsewhere all the time: m a = kp e + kd de/dt - f."""
     mass, hit, kp, kd, speed = 3.0, 2.0, 4000.0, 60.0, 1.2
@@ -114,6 +115,7 @@ def test_a_servo_on_a_slide_against_scipy() -> None:
     assert errors[1] < errors[0] / 2.5 and errors[2] < errors[1] / 2.5 and errors[2] < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_engines_and_batches_agree() -> None:
     """On the small biped, whose reference bends in all joints at random."""
@@ -297,6 +299,7 @@ def within(model: dict[str, Any], other: dict[str, Any], bounds: dict[str, float
         assert abs(model[key] - other[key]) <= bound * size, (key, model[key], other[key])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("kind", ["solve", "strike"])
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -401,6 +404,7 @@ def test_a_slower_result_bends_the_same_way(tmp_path: Path, punch: Solution) -> 
     assert states.posture("half_sitting", None, tuple(problem.point)).reference is None  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_the_command_shows_both(tmp_path: Path) -> None:
     result = saved("solve", "arm_planar", tmp_path / "arm")

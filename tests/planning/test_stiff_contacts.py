@@ -66,6 +66,7 @@ def diagnosed(problem: ImpactProblem) -> SolverResult:
 # ---- plans
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stiffness", "ratio"), [(1e6, False), (1e7, True), (1e8, True), (1e8, False)])
 def test_a_stiff_contact_is_planned_as_it_is_replayed(stiffness: float, ratio: bool) -> None:
     """However stiff hammer and nail are, momentum and wood decide: the blow stays about as hard."""
@@ -85,6 +86,7 @@ def test_a_stiff_contact_is_planned_as_it_is_replayed(stiffness: float, ratio: b
         assert solution.summary()["caution"] == str(followed)
 
 
+@pytest.mark.slow
 def test_a_contact_too_soft_for_its_nail_is_named() -> None:
     """`hit point, 48 mm away` alone would not say so; nor would a time of 15 ms a phase, which is not all."""
     problem = with_stiffness("arm_planar", 1e4, ratio=False)
@@ -99,6 +101,7 @@ def test_a_contact_too_soft_for_its_nail_is_named() -> None:
     assert "takes 33 ms" not in solution.result.message  # 0.2 s are enough for that
 
 
+@pytest.mark.slow
 def test_a_time_far_too_short_for_its_contact_is_named() -> None:
     """Shorter than the least that a phase is given where no shortest time is asked for."""
     result = diagnosed(dataclasses.replace(load_problem("arm_planar"), contact_duration=(0.0, 5e-5)))
@@ -107,6 +110,7 @@ def test_a_time_far_too_short_for_its_contact_is_named() -> None:
     assert "instead of 5e-05 s ([collision] duration_s)" in result.message
 
 
+@pytest.mark.slow
 def test_a_board_that_takes_more_than_one_contact_is_named() -> None:
     """The hammer is off again long before the board breaks; the frozen model ends there."""
     once = dataclasses.replace(with_stiffness("chop_arm", 1e7, ratio=False), collision="sdc")
@@ -141,6 +145,7 @@ def test_a_damped_nail_does_not_rattle(hammered: Solution) -> None:
     assert not hammered.caution
 
 
+@pytest.mark.slow
 def test_a_stiff_nail_rattles_with_the_force_of_the_first_impact(hammered: Solution) -> None:
     """Without damping: the spring takes the energy of the approach, v sqrt(k mu), and what wood holds."""
     p, plan = hammered.problem, hammered.plan
@@ -193,6 +198,7 @@ def broken() -> Solution:
     return solve(soft_board(250.0))
 
 
+@pytest.mark.slow
 def test_a_board_breaks_when_it_is_planned_to(broken: Solution) -> None:
     assert broken.status is Status.SOLVED
     assert collided(broken) == pytest.approx(broken.impulse, rel=2e-3)

@@ -324,6 +324,7 @@ def test_a_strike_starts_another_without_its_obstacle(arm_transcription: Transcr
 # ---- several starts
 
 
+@pytest.mark.slow
 def test_the_best_of_several_starts_is_kept_and_all_are_told(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -436,6 +437,7 @@ def test_no_start_ends_with_bodies_in_each_other(
     assert all(a.status.usable for a in found.attempts)
 
 
+@pytest.mark.slow
 def test_a_solution_starts_its_neighbour(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:

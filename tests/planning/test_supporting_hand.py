@@ -50,6 +50,7 @@ def grip_of(problem: ImpactProblem) -> Grip:
     return grip
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_hand_stays_where_it_is(solution: Solution) -> None:
     """At every instant of the reference, by Pinocchio; and at rest, without a grip's force."""
@@ -100,6 +101,7 @@ def test_motion_and_wrenches_balance_at_the_nodes(solution: Solution) -> None:
         assert (np.abs(tau[6:]) <= p.robot.torque_limit).all()
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_collision_is_that_of_full_dynamics(solution: Solution) -> None:
     """Impulse within 1 %, and so are the forces on soles and hand, of what both hold."""
@@ -123,6 +125,7 @@ def test_the_collision_is_that_of_full_dynamics(solution: Solution) -> None:
     assert abs(free.impulse / full.impulse - 1) > 0.01
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_it_is_true_in_both_engines(solution: Solution, engine: str) -> None:

@@ -63,6 +63,7 @@ def test_only_a_long_slide_is_told() -> None:
     assert "slides 201 mm" in slide_caution(0.201)
 
 
+@pytest.mark.slow
 def test_a_plan_that_slides_too_far_gets_rows(monkeypatch: pytest.MonkeyPatch, plan: Plan) -> None:
     """To the plan that rows from the start lead to; and none where it is switched off."""
     most = 0.3 * slide(plan.problem, plan)

@@ -68,6 +68,7 @@ def swung(request: pytest.FixtureRequest) -> Solution:
 # ---- plans
 
 
+@pytest.mark.slow
 def test_it_is_solved_with_the_touches_that_point_masses_need(chopped: Solution) -> None:
     assert chopped.status is Status.SOLVED
     assert chopped.problem.planned_touches == 2
@@ -88,12 +89,14 @@ def test_it_is_replayed_as_planned(chopped: Solution) -> None:
     assert followed.outcome == {"broken": 1.0}
 
 
+@pytest.mark.slow
 def test_mujoco_says_so_too(chopped: Solution) -> None:
     replay = chopped.validate(engine="mujoco")
     assert replay.impulse == pytest.approx(chopped.impulse, rel=1e-2)
     assert replay.peak_force == pytest.approx(chopped.plan.collision.force.max(), rel=0.02)
 
 
+@pytest.mark.slow
 def test_bristles_of_both_touches_are_those_of_replays() -> None:
     """In a gap they are released: a touch begins with unbent ones, whatever bent them before."""
     rough = ContactFriction(coefficient=0.6, stiffness=8e5)
@@ -153,6 +156,7 @@ def test_steps_of_replays_do_not_move_the_second_touch(chopped: Solution) -> Non
     assert coarse.touches[1][0] == pytest.approx(fine.touches[1][0], rel=5e-4)
 
 
+@pytest.mark.slow
 def test_a_servo_of_much_damping_is_followed_too(chopped: Solution) -> None:
     """An explicit rule is stable for steps below two over its fastest rate alone."""
     p, duration = chopped.problem, chopped.plan.compression + chopped.plan.restitution
@@ -166,6 +170,7 @@ def test_a_servo_of_much_damping_is_followed_too(chopped: Solution) -> None:
     assert coarse.impulse == pytest.approx(fine.impulse, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_the_model_is_full_where_the_frozen_one_has_no_such_order() -> None:
     solution = solve(stiff(1e7, collision="auto"))
     assert solution.status is Status.SOLVED
@@ -183,6 +188,7 @@ def test_a_strike_is_planned_so_too() -> None:
     assert abs(followed.impulse_pct) < 0.5
 
 
+@pytest.mark.slow
 def test_one_touch_has_no_plan_and_the_order_that_has_one_is_named() -> None:
     """With scenarios it is not chosen."""
     with pytest.warns(NotSolvedWarning, match="one contact is not enough"):
@@ -205,6 +211,7 @@ def rattled(request: pytest.FixtureRequest) -> Solution:
     )
 
 
+@pytest.mark.slow
 def test_a_nail_starts_in_its_first_touch_and_stops_in_its_last(rattled: Solution) -> None:
     assert rattled.status is Status.SOLVED
     assert rattled.problem.order == ("start", *(SEPARATION, TOUCH) * 2, "stop", SEPARATION)
@@ -212,6 +219,7 @@ def test_a_nail_starts_in_its_first_touch_and_stops_in_its_last(rattled: Solutio
     assert "caution" not in rattled.summary()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_its_touches_are_those_of_replays(rattled: Solution, engine: str) -> None:
     """One touch would have 34 and 40 % less peak force."""
@@ -241,6 +249,7 @@ def test_work_on_its_head_is_that_of_the_wood(rattled: Solution) -> None:
     assert (-wood.mass * resisted <= 1.01 * deep[1]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("damping", "number"), [(200.0, "touches = 3"), (20.0, "")])
 def test_a_plan_of_one_touch_names_the_number_that_plans_them(damping: float, number: str) -> None:
     """With less damping the nail stops in a gap and is driven again: no number of touches plans that."""
@@ -255,6 +264,7 @@ def test_a_plan_of_one_touch_names_the_number_that_plans_them(damping: float, nu
 # ---- boards that break after the last touch
 
 
+@pytest.mark.slow
 def test_a_board_swings_on_after_one_touch_and_breaks(swung: Solution) -> None:
     assert swung.status is Status.SOLVED
     assert swung.problem.order[-2:] == (SEPARATION, "break")
@@ -268,6 +278,7 @@ def test_a_board_swings_on_after_one_touch_and_breaks(swung: Solution) -> None:
     assert 1e3 * followed.contact == pytest.approx(swung.summary()["contact_ms"], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_its_touch_is_that_of_replays(swung: Solution, engine: str) -> None:
     replay = swung.validate(engine=engine)
@@ -304,6 +315,7 @@ def test_touches_that_do_not_come_are_refused(plan: Any, stiffness: float, touch
         plan(stiff(stiffness, touches=touches))
 
 
+@pytest.mark.slow
 def test_a_plan_starts_from_a_neighbour(chopped: Solution) -> None:
     again = solve(stiff(1.05 * chopped.problem.law.parameters["stiffness"]), start=chopped)
     assert again.status is Status.SOLVED
@@ -335,6 +347,7 @@ def test_what_is_saved_is_read_with_its_touches(chopped: Solution, tmp_path: Pat
     assert load_planned(tmp_path / "older").problem.order == phases
 
 
+@pytest.mark.slow
 def test_a_board_with_a_heavier_one_as_a_scenario() -> None:
     """All targets are met as often; point masses are not asked then."""
     others = (Scenario(name="heavier", mass=1.2),)
@@ -345,6 +358,7 @@ def test_a_board_with_a_heavier_one_as_a_scenario() -> None:
     assert heavier.impulse != solution.impulse
 
 
+@pytest.mark.slow
 def test_contact_time_of_a_scenario_is_without_the_swing_to_the_break() -> None:
     others = (Scenario(name="heavier", mass=1.2),)
     solution = solve(stiff(1e7, scenarios=others, touches=(SEPARATION, "break")))
@@ -380,6 +394,7 @@ def test_phases_of_several_touches(touches: int) -> None:
     assert len({phase.name for phase in phases}) == len(phases)
 
 
+@pytest.mark.slow
 def test_touches_of_point_masses() -> None:
     """Without damping they part after half a period of the spring between them."""
     soft, hard = (KelvinVoigt(stiffness=k, damping=50.0) for k in (1e5, 1e7))
@@ -422,6 +437,7 @@ def test_a_guess_has_the_speed_of_its_order() -> None:
 # ---- gears
 
 
+@pytest.mark.slow
 def test_gears_that_bear_no_impact_are_named_without_a_search() -> None:
     problem = stiff(1e7, terms=load_problem("chop_arm").terms)
     with pytest.warns(NotSolvedWarning):
@@ -431,6 +447,7 @@ def test_gears_that_bear_no_impact_are_named_without_a_search() -> None:
     assert solution.result.iterations < 500
 
 
+@pytest.mark.slow
 def test_an_estimate_of_gears_does_not_end_a_solve_that_has_a_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few iterations are for problems without one: a motion within all bounds goes on to the optimum."""
     problem = stiff(touches=2)

@@ -58,6 +58,7 @@ def places(problem: ImpactProblem, q: Array) -> Array:
     return np.array([data.oMf[model.getFrameId(f"striker:{name}")].translation for name in problem.strikers])
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_both_hands_touch_and_part_at_one_instant(solution: Solution) -> None:
     p, ref, hit = solution.problem, solution.trajectory, solution.plan.collision
@@ -166,6 +167,7 @@ def test_the_collision_is_that_of_full_dynamics(solution: Solution) -> None:
     assert duration == pytest.approx(hit.time[-1], rel=0.03)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_it_is_true_in_both_engines(solution: Solution, engine: str) -> None:
@@ -187,6 +189,7 @@ def test_it_is_true_in_both_engines(solution: Solution, engine: str) -> None:
         assert led.impulse == pytest.approx(solution.impulse, rel=3e-2)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_blow_alone_has_both_hands(problem: ImpactProblem) -> None:
     strike = optimize_strike(problem)

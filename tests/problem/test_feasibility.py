@@ -172,6 +172,7 @@ def test_legs_come_first_where_the_robot_can_be_built(tmp_path: Path) -> None:
     assert "'left' has 5 joints" in first and "'nose'" in second
 
 
+@pytest.mark.slow
 def test_check_refuses_what_no_solve_can_fix(tmp_path: Path) -> None:
     file = _written(tmp_path, urdfs.biped())
     runner = CliRunner()

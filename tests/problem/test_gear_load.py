@@ -47,6 +47,7 @@ def test_a_limit_by_joint_is_not_changed_by_its_caller() -> None:
     assert load.limit == {"joint_1": 1.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("damping", [0.0, 300.0])
 def test_one_joint_hits_a_spring_and_a_damper(engine: str, damping: float) -> None:
@@ -210,6 +211,7 @@ def nailed() -> Solution:
     return solve(replace(problem, target=Nail(mass=0.05, resistance=200.0, hardening=1e4), terms=GEARS))
 
 
+@pytest.mark.slow
 def test_a_limit_of_one_holds_in_replays(nailed: Solution) -> None:
     """First instant included: Kelvin-Voigt's damper has a force at once."""
     assert nailed.status.usable

@@ -70,6 +70,7 @@ def arm_plans(arm_transcription: Transcription) -> dict[str, tuple[dict[str, flo
     return out
 
 
+@pytest.mark.slow
 def test_each_objective_gets_more_of_its_own_quantity(
     arm_plans: dict[str, tuple[dict[str, float], Plan]],
 ) -> None:
@@ -113,6 +114,7 @@ def test_effort_is_the_integral_of_torque_over_limit(
         assert got["effort"] == pytest.approx(total, rel=0.05)
 
 
+@pytest.mark.slow
 def test_angular_momentum_is_kept_small(biped_transcription: Transcription, biped_plan: Planned) -> None:
     """Beside the impulse, and squared in the program: what the follow-through starts with."""
     objectives = (Impulse(), AngularMomentum(weight=1.0))

@@ -212,6 +212,7 @@ def test_the_hash_is_of_the_content(problem: ImpactProblem) -> None:
     assert len({problem.hash, *other}) == 1 + len(other)
 
 
+@pytest.mark.slow
 def test_the_hash_is_the_same_in_another_process(problem: ImpactProblem) -> None:
     code = (
         "from impactopt.files.problem_file import problem_from_data\n"

@@ -84,6 +84,7 @@ def balance(solved: Planned, q: Array, v: Array) -> tuple[float, float, float]:
     return inside, float(velocity[2]), float(np.abs(momentum.angular).max())
 
 
+@pytest.mark.slow
 def test_it_solves_and_each_target_that_is_hit_is_foreseen(solved: Planned) -> None:
     assert solved.result.status is Status.SOLVED
     wanted = [s.name for s in solved.problem.scenarios if not s.missing]

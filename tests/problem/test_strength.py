@@ -54,12 +54,14 @@ def test_robots_on_soles_have_the_nearest_posture() -> None:
     assert np.array_equal(strongest_posture(problem, 1), problem.contact_posture)
 
 
+@pytest.mark.slow
 def test_one_initial_guess_is_as_good_as_several() -> None:
     problem = load_problem("arm7")
     plain, several = solve(problem), solve(problem, starts=3)
     assert plain.status.usable and plain.impulse > 0.98 * several.impulse
 
 
+@pytest.mark.slow
 def test_a_solve_searches_its_posture_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The scale of the prices and the initial guess take the same one."""
     searched = list[int]()
@@ -72,6 +74,7 @@ def test_a_solve_searches_its_posture_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert solve(load_problem("arm7")).status.usable and searched == [0]
 
 
+@pytest.mark.slow
 def test_drawn_postures_turn_the_links_face_to_the_normal() -> None:
     """No vertex of the link is farther beyond the target's plane, at any normal, oblique ones too."""
     problem = load_problem("arm7")

@@ -319,6 +319,7 @@ def shown(board: ImpactProblem, tmp_path_factory: pytest.TempPathFactory) -> lis
     return [checked(seen, names) for seen, names in zip(visits, scripts, strict=True)]
 
 
+@pytest.mark.slow
 def test_the_world_moves_on_a_page_as_it_does_in_pictures(
     shown: list[dict[str, Any]], board: ImpactProblem
 ) -> None:

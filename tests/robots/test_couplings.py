@@ -128,6 +128,7 @@ def close(ours: Any, reference: Any) -> None:
     )
 
 
+@pytest.mark.slow
 @given(pair=PAIRS, base=st.sampled_from(["quaternion", "rpy"]))
 @settings(max_examples=15, deadline=None)
 def test_symbolic_dynamics_are_those_of_the_free_tree(pair: Pair, base: str) -> None:
@@ -469,6 +470,7 @@ def test_followers_of_an_mjcf_are_where_mujoco_has_them(tmp_path: Path) -> None:
 # ---- collisions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [-2.0, 0.5])
 def test_two_coupled_masses_hit_as_one_of_their_effective_mass(ratio: float) -> None:
     """Of masses 2 and 3 kg on rails, the first strikes: 2 + 3 ratio^2."""
@@ -494,6 +496,7 @@ def test_two_coupled_masses_hit_as_one_of_their_effective_mass(ratio: float) -> 
         assert kind(robot=two, **settings).collide(*state).impulse == pytest.approx(one, rel=within)
 
 
+@pytest.mark.slow
 def test_full_dynamics_of_followers_are_mujocos() -> None:
     robot = parallelogram()
     settings: dict[str, Any] = {"robot": robot, "striker": "tip", "normal": np.array([0.0, 0.0, -1.0])}

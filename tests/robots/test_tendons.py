@@ -100,6 +100,7 @@ def tied(problem: ImpactProblem, upper: float) -> ImpactProblem:
     return dataclasses.replace(problem, robot=robot)
 
 
+@pytest.mark.slow
 def test_a_plan_keeps_a_tendon_in_its_range(arm_plan: Planned) -> None:
     free = arm_plan.problem
     most, start = sums(arm_plan).max(), sums(arm_plan)[0]
@@ -117,6 +118,7 @@ def test_a_plan_keeps_a_tendon_in_its_range(arm_plan: Planned) -> None:
     assert plan.plan.impulse < arm_plan.plan.impulse
 
 
+@pytest.mark.slow
 def test_motions_out_of_a_tendons_range_are_told(arm_plan: Planned) -> None:
     """By the replay, and by the checks of a record."""
     beyond = 0.1

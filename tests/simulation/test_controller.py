@@ -260,6 +260,7 @@ def test_the_recovery_begins_after_the_blow_and_goes_on_from_where_the_plan_is()
 # ---- what it does
 
 
+@pytest.mark.slow
 def test_it_stands_still_with_noise_and_delay() -> None:
     done = stand(settings=ControllerSettings())
     assert done.standing, done.fall
@@ -268,6 +269,7 @@ def test_it_stands_still_with_noise_and_delay() -> None:
     assert done.posture_error < 0.02
 
 
+@pytest.mark.slow
 def test_it_stands_after_a_push_that_the_servo_does_not_survive() -> None:
     pushed = Perturbation(push=90.0, push_start=0.1, push_time=0.1, period=1e-3)
     assert not stand(pushed).standing

@@ -54,6 +54,7 @@ def rates(reference: Trajectory, robot: Robot, t: float) -> np.ndarray:
     return np.asarray((1 - s) * reference.v[k] + s * reference.v[k + 1])[-robot.n :]
 
 
+@pytest.mark.slow
 def test_the_reference_of_a_robot_that_feels_nothing_is_continuous(short: Solution) -> None:
     reference, missed, robot = short.trajectory, short.missed_trajectory, short.problem.robot
     followed = FollowedReference(reference, missed)
@@ -69,6 +70,7 @@ def test_the_reference_of_a_robot_that_feels_nothing_is_continuous(short: Soluti
     assert np.abs(apart).max() > 10 * MOST
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_a_missed_blow_asks_for_no_more_torque_than_planned(short: Solution, engine: str) -> None:
     options: dict[str, Any] = {"missing": True}

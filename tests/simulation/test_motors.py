@@ -114,6 +114,7 @@ def test_lags_that_are_none_are_refused(numbers: dict[str, float]) -> None:
 
 
 # ---------------------------------------------------------------- closed forms, in both engines
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_push_beyond_the_line_ends_at_the_no_load_speed(engine: str) -> None:
     """Constant until the line is met; then the speed goes to no load's with the line's own rate."""
@@ -154,6 +155,7 @@ def test_a_spring_swings_about_its_rest(engine: str) -> None:
     assert not found.torque.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_delay_shifts_what_is_asked_for(engine: str) -> None:
     """Half of it a ramp, so that instants between steps count."""
@@ -200,6 +202,7 @@ def mujocos_motor(robot: Robot, reference: Any, *, lag: float, step: float) -> t
     return time, angles, torques
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_motor_is_mujocos_own(engine: str) -> None:
     """A swing there and back that is too fast for the motor: it brakes harder than it drives."""
@@ -232,6 +235,7 @@ def test_a_motor_is_mujocos_own(engine: str) -> None:
 
 
 # ---------------------------------------------------------------- what is told
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_replay_says_where_a_line_has_cut(engine: str) -> None:
     robot = lever(stall_torque=STALL, no_load_speed=3.0)

@@ -45,6 +45,7 @@ def centre_of_mass(robot: Robot, q: Array) -> Array:
 # ---- two point masses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.0, 100.0, 300.0])
 @pytest.mark.parametrize("step", [4e-4, 1e-4])
 def test_two_point_masses_collide_as_in_the_closed_form(damping: float, step: float) -> None:
@@ -58,6 +59,7 @@ def test_two_point_masses_collide_as_in_the_closed_form(damping: float, step: fl
     assert 6.0 * sim.hand_speed[-1] + sim.impulse == pytest.approx(6.0 * exact["speed"], rel=1e-10)
 
 
+@pytest.mark.slow
 def test_the_impulse_of_two_point_masses_does_not_hang_on_the_step() -> None:
     """Within a step the contact is followed with errors of its own."""
     for step in (4e-4, 2e-4, 1e-4, 5e-5):
@@ -65,6 +67,7 @@ def test_the_impulse_of_two_point_masses_does_not_hang_on_the_step() -> None:
         assert sim.impulse == pytest.approx(exact["impulse"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_an_arm_hits_as_in_pinocchio() -> None:
     """Fixed base, servo, four joints: both engines tend to the same collision."""
     robot, name = arm(), "striker:hand"
@@ -302,6 +305,7 @@ def test_a_robot_that_is_to_end_on_one_foot_stands_on_it() -> None:
     np.testing.assert_allclose(sim.sole_normal[-1], [weight(robot), 0.0], atol=1e-3 * weight(robot))
 
 
+@pytest.mark.slow
 def test_what_slides_away_stands_no_more() -> None:
     """On ice, pushed: it is upright and at rest in the end, but not where it stood."""
     robot = biped()
@@ -323,6 +327,7 @@ def blow() -> tuple[Robot, Any, Scene]:
     return blow_motion()
 
 
+@pytest.mark.slow
 def test_momentum_is_balanced_by_ground_gravity_and_target(blow: tuple[Robot, Any, Scene]) -> None:
     """Linear, and angular about the world's origin, over the whole motion, to the order of the step."""
     robot, motion, there = blow
@@ -349,6 +354,7 @@ def test_momentum_is_balanced_by_ground_gravity_and_target(blow: tuple[Robot, An
     assert worst[1] < 0.6 * worst[0] < 2e-3
 
 
+@pytest.mark.slow
 def test_soles_that_stay_down_hit_as_held_ones_do(blow: tuple[Robot, Any, Scene]) -> None:
     robot, motion, there = blow
     held = simulate_pinocchio(robot, motion, there, settle=0.0)
@@ -400,6 +406,7 @@ def test_the_servo_samples_and_holds_and_comes_late() -> None:
 # ---- perturbations
 
 
+@pytest.mark.slow
 def test_conditions_change_the_target() -> None:
     """Mass, stiffness and damping are factors: the closed form of the changed collision holds."""
     changed = Perturbation(mass=2.0, stiffness=1.0, damping=0.5)
@@ -419,6 +426,7 @@ def test_conditions_change_the_target() -> None:
     assert soft.impulse == pytest.approx(stiff.impulse, rel=1e-3)  # without loss the masses alone decide
 
 
+@pytest.mark.slow
 def test_a_target_that_waits_elsewhere_or_not_at_all() -> None:
     def start(**perturbation: Any) -> Simulation:
         world = Perturbation(**perturbation)
@@ -518,6 +526,7 @@ def test_a_diverging_replay_says_so_and_leaves_no_log(
 # ---- the demo's punch
 
 
+@pytest.mark.slow
 def test_the_demos_punch_stands_on_its_own_feet(punch: Solution) -> None:
     assert punch.status.usable
     sim = punch.validate(engine="mujoco")
@@ -568,6 +577,7 @@ def test_a_replay_ends_where_it_is_told_to(punch: Solution, engine: str) -> None
             punch.validate(engine=engine, until=bad)
 
 
+@pytest.mark.slow
 def test_a_replay_far_from_the_plan_does_not_pass_for_one_that_stands(punch: Solution) -> None:
     sim = punch.validate(engine="mujoco", step=1e-3, perturbation=Perturbation(torque_limit=0.3))
     assert sim.standing is False
@@ -590,6 +600,7 @@ def hulls(ahead: float, at: Array) -> Solids:
     return Solids(solids=(hand, replace(box, strikable=True)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ahead", [0.0, 0.006])
 def test_a_link_hits_when_its_hull_meets_the_targets_body(ahead: float) -> None:
     """As early as its front is ahead, and as hard as the point that it stands for."""

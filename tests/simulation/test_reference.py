@@ -109,6 +109,7 @@ def test_a_contact_does_not_pull_before_it_presses(engine):
 
 
 # ------------------------------------------------------------ an integration of its own
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"friction": FRICTION}])
 def test_fixed_arm_against_scipy(options):
     """The arm swings in contact, with saturated joints; Pinocchio's matrices, and no code of ours."""
@@ -156,6 +157,7 @@ def test_fixed_arm_against_scipy(options):
 
 
 # ------------------------------------------------------------ the two forms
+@pytest.mark.slow
 @pytest.mark.parametrize("stance", [None, OneSole("left")])
 def test_forms_agree(stance):
     # so exact that their histories, which lie inside of other steps, are the same
@@ -180,6 +182,7 @@ def test_forms_agree_on_talos():
 
 
 # ------------------------------------------------------------ balances
+@pytest.mark.slow
 @pytest.mark.parametrize("stance", [None, OneSole("right"), BothSoles(base_mass=1e3, base_inertia=1e2)])
 def test_rate_of_the_whole_robots_momentum_is_the_wrenches_on_it(stance):
     model = small(stance=stance, friction=FRICTION, step=1e-4)
@@ -249,6 +252,7 @@ def test_impulse_energy_and_histories():
 
 
 # ------------------------------------------------------------ integration
+@pytest.mark.slow
 def test_errors_below_the_tolerance_through_all_events():
     model = small(mass=5.0, horizon=0.5, friction=JointFriction(viscous=1.0, coulomb=1.0, transition=0.05))
     q, v, torque = blow(model, speed=2.0)
@@ -263,6 +267,7 @@ def test_errors_below_the_tolerance_through_all_events():
         assert np.abs(final(tolerance) - exact).max() < tolerance
 
 
+@pytest.mark.slow
 def test_converged_says_how_well():
     model = small(mass=2.0, step=4e-4)
     q, v, torque = blow(model)
@@ -308,6 +313,7 @@ def test_a_contact_too_fast_to_follow_is_refused(monkeypatch):
 
 
 # ------------------------------------------------------------ the simplified computation
+@pytest.mark.slow
 def test_frozen_dynamics_is_the_limit_of_short_collisions():
     """A contact four times as stiff lasts half as long, and so is at most half as far from the frozen one."""
     errors = []
@@ -451,6 +457,7 @@ def test_two_masses_in_mujoco():
     assert result.sole_wrench is None and result.zmp is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"stance": OneSole("left"), "friction": FRICTION}])
 def test_mujoco_agrees(options):
     model = small(**options)
@@ -484,6 +491,7 @@ def test_mujoco_agrees_on_talos(seed, speed):
     np.testing.assert_allclose(result.zmp[-1], exact.zmp[-1], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_mujoco_is_asked_for(monkeypatch):
     model = small()
     with pytest.raises(InputError, match="virtual base"):

@@ -149,6 +149,7 @@ def test_the_force_is_that_of_each_instant(engine: Engine, damping: float) -> No
     assert sim.contact_force[-1] == 0.0
 
 
+@pytest.mark.slow
 @ENGINES
 @pytest.mark.parametrize(
     ("law", "target"),
@@ -178,6 +179,7 @@ def test_the_blow_is_that_of_an_independent_integration(
     assert sim.hand_speed[-1] == pytest.approx(SPEED - sim.impulse / MASS, rel=1e-9)
 
 
+@pytest.mark.slow
 @ENGINES
 def test_switches_cost_no_accuracy(engine: Engine) -> None:
     """A nail slips and sticks, a board breaks, within steps of the engine: the contact has its own."""
@@ -205,6 +207,7 @@ def test_light_and_heavy_targets_of_steel_are_those_of_an_independent_integratio
         assert len(sim.touches) == 1 and sim.touches[0][2] == pytest.approx(exact, rel=1e-3)
 
 
+@pytest.mark.slow
 @ENGINES
 @pytest.mark.parametrize("mass", [1e-4, 5e-3])
 def test_a_light_nail_is_driven_as_by_an_independent_integration(engine: Engine, mass: float) -> None:
@@ -287,6 +290,7 @@ def test_a_nail_that_is_not_there_stays_as_it_was() -> None:
 # ---- plans
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "changes"),
     [

@@ -185,6 +185,7 @@ def rows_of(result: Robustness) -> list[tuple[Any, ...]]:
     return [tuple(row) for row in zip(*columns, strict=True)]
 
 
+@pytest.mark.slow
 def test_one_worker_and_two_give_the_same_numbers(still: tuple[Any, Any]) -> None:
     told: list[tuple[int, int]] = []
     given: dict[str, Any] = {"draws": 3, "step": STEP / 2}
@@ -196,6 +197,7 @@ def test_one_worker_and_two_give_the_same_numbers(still: tuple[Any, Any]) -> Non
     assert told == [(1, 3), (2, 3), (3, 3)]
 
 
+@pytest.mark.slow
 def test_what_is_drawn_reaches_the_replay(still: tuple[Any, Any]) -> None:
     """A still robot stands by its servo, and falls without it; the payload is not the reason."""
     calm = PerturbationRanges(
@@ -216,6 +218,7 @@ def test_a_controller_has_its_own_rate(still: tuple[Any, Any]) -> None:
     assert result.perturbations[0].period == result.drawn_from.period == 0
 
 
+@pytest.mark.slow
 def test_of_a_wall_no_mass_is_drawn(still: tuple[Any, Any]) -> None:
     _, motion = still
     wall = still_problem(target=RigidWall())
@@ -277,6 +280,7 @@ def die(shared: int, given: int) -> int:
     return given * given
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_costs_its_own_input_only() -> None:
     found = map_on_workers(die, 2, [1, 2, 3, 4], workers=2, crashed=lambda code: code)
     assert found == [1, -signal.SIGKILL, 9, 16]
@@ -302,6 +306,7 @@ def run_script(folder: Path, text: str) -> subprocess.Popen[str]:
         signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_is_told_of_it(tmp_path: Path) -> None:
     process = run_script(
         tmp_path,
@@ -319,6 +324,7 @@ def test_a_script_without_a_guard_is_told_of_it(tmp_path: Path) -> None:
     assert 'under `if __name__ == "__main__":`' in errors
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_processes_and_is_raised(tmp_path: Path) -> None:
     process = run_script(
         tmp_path,

@@ -39,6 +39,7 @@ def test_two_point_masses_collide_as_in_the_closed_form(damping: float) -> None:
     assert 6.0 * after + 5.0 * sim.target_speed[-1] == pytest.approx(6.0 * exact["speed"], rel=1e-12)
 
 
+@pytest.mark.slow
 def test_an_undamped_collision_keeps_the_energy() -> None:
     sim, exact = strike(0.0)
     before = 0.5 * 6.0 * exact["speed"] ** 2
@@ -46,6 +47,7 @@ def test_an_undamped_collision_keeps_the_energy() -> None:
     assert after == pytest.approx(before, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_the_damper_works_in_compression_only_and_contact_never_pulls() -> None:
     sim, _ = strike(300.0)
     contact = sim.phase() == 1
@@ -59,6 +61,7 @@ def test_the_damper_works_in_compression_only_and_contact_never_pulls() -> None:
     np.testing.assert_allclose(rate, 1e4 * middle, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_contact_is_finer_recorded_and_the_impulse_is_the_forces_integral() -> None:
     sim, exact = strike(100.0)
     contact = sim.phase() == 1
@@ -68,6 +71,7 @@ def test_contact_is_finer_recorded_and_the_impulse_is_the_forces_integral() -> N
     assert impulse == pytest.approx(sim.impulse, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_smaller_step_is_nearer_to_the_closed_form() -> None:
     errors = []
     for step in (4e-4, 1e-4):
@@ -121,6 +125,7 @@ def test_the_servo_is_the_robots_and_saturates() -> None:
     assert (sim.torque[1:, 2] == 10.0).all()
 
 
+@pytest.mark.slow
 def test_a_continuous_joint_is_held_past_half_a_turn_the_short_way() -> None:
     """In q it is a cosine and a sine; the servo is on its angle."""
     robot = arm(postures={"start": {"turn": 3.1, "shoulder": 0.3, "elbow": 1.2, "wrist": 0.3}})
@@ -172,6 +177,7 @@ def blow() -> tuple[Robot, Scene, Simulation]:
     return robot, there, simulate_pinocchio(robot, motion, there, step=1e-4, settle=0.0, record=1)
 
 
+@pytest.mark.slow
 def test_momentum_is_balanced_by_ground_gravity_and_target(blow: tuple[Robot, Scene, Simulation]) -> None:
     """Linear: robot + target; angular, about the world's origin: with the contact force's moment."""
     robot, there, sim = blow
@@ -236,6 +242,7 @@ def test_a_blow_has_three_phases_and_a_summary(blow: tuple[Robot, Scene, Simulat
     assert out["hand_speed_m_s"] > 0.5
 
 
+@pytest.mark.slow
 def test_a_fixed_base_has_no_zmp() -> None:
     sim, exact = strike(100.0)
     out = sim.summary(

@@ -177,6 +177,7 @@ def test_repeated_failures_end_the_solve(monkeypatch):
     assert len(result.history) <= 3
 
 
+@pytest.mark.slow
 def test_elastic_constraints_that_are_met_become_hard_again():
     """Nails in wood: the first two once ended at the iteration limit, with constraints elastic and met."""
     problem = load_problem("arm_planar")

@@ -125,6 +125,7 @@ def test_infeasible_constraints_are_named(name, way):
     assert named <= set(constraints)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", UNBOUNDED)
 def test_unbounded_programs_end_far_out(name, way):

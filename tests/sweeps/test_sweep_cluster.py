@@ -44,6 +44,7 @@ def client() -> Iterator[Any]:
         yield client
 
 
+@pytest.mark.slow
 def test_a_worker_of_the_cluster_that_is_killed_costs_nothing(tmp_path: Path, client: Any) -> None:
     chosen = sweep_from_data(SWEEP)
     work = Work(data=chosen.problem.data, path=chosen.problem.path, settings=chosen.settings)
@@ -70,6 +71,7 @@ def test_a_worker_of_the_cluster_that_is_killed_costs_nothing(tmp_path: Path, cl
     assert (again.resumed, again.done) == (5, 5)
 
 
+@pytest.mark.slow
 def test_units_that_kill_every_worker_are_rows_and_closing_forgets_the_rest(
     tmp_path: Path, client: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,6 +101,7 @@ def test_workers_of_another_version_are_refused(client: Any) -> None:
         list(on_cluster(work, [Unit(index=0, first=0, count=1, columns={})], client, print))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_used_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("impactopt.sweeps.cluster.CONNECT_TIMEOUT", 0.5)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):

@@ -216,6 +216,7 @@ def test_a_sweep_is_the_same_with_another_figure() -> None:
     assert sweep_from_data(collisions_data()).hash == sweep_from_data(collisions_data(title="new")).hash
 
 
+@pytest.mark.slow
 def test_the_command_draws(tmp_path: Path) -> None:
     file = tmp_path / "arm.toml"
     file.write_text(

@@ -62,6 +62,7 @@ for unit in range(10**9):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("said", [1, 30])
 def test_a_kill_loses_no_unit_that_was_added(tmp_path: Path, said: int) -> None:
     command = [sys.executable, "-c", ADDING, str(tmp_path / "j")]

@@ -113,6 +113,7 @@ def finished(journal: Path) -> int:
         return 0
 
 
+@pytest.mark.slow
 def test_a_parent_that_is_killed_leaves_no_orphans_and_its_rows(
     tmp_path: Path, undisturbed: list[dict[str, Any]]
 ) -> None:
@@ -145,6 +146,7 @@ def test_a_parent_that_is_killed_leaves_no_orphans_and_its_rows(
     assert rows(Path(summary["table"])) == undisturbed
 
 
+@pytest.mark.slow
 def test_a_failure_is_a_row_with_its_reason_and_results_are_kept_on_demand(tmp_path: Path) -> None:
     points = [[0.7, 0.0, 0.75], [30.0, 0.0, 0.75]]
     given = {
@@ -173,11 +175,13 @@ def test_a_failure_is_a_row_with_its_reason_and_results_are_kept_on_demand(tmp_p
 
 
 # ---------------------------------------------------------------- workers
+@pytest.mark.slow
 def test_an_input_is_tried_again_so_often_and_no_more(tmp_path: Path) -> None:
     found = each_on_workers(unlucky, tmp_path, enumerate(range(3)), workers=2, again=lambda d: d.tries < 3)
     assert dict(found) == {0: Died(code=-signal.SIGKILL, tries=3), 1: 1, 2: 2}
 
 
+@pytest.mark.slow
 def test_a_case_that_does_not_stop_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     began = time.perf_counter()
     assert dict(each_on_workers(slow, 0.3, [(0, 0)], workers=1)) == {0: Died(code=ENDED_BY_WATCHDOG, tries=1)}
@@ -194,6 +198,7 @@ def test_a_case_that_does_not_stop_is_ended(monkeypatch: pytest.MonkeyPatch) -> 
     assert crashed["reason"] == ["its process died 3 times (killed by SIGSEGV)"]
 
 
+@pytest.mark.slow
 def test_workers_have_one_blas_thread() -> None:
     assert dict(each_on_workers(pools, None, [(0, 0)], workers=1)) == {0: 1}
 
@@ -212,6 +217,7 @@ def test_a_bad_sweep_file_is_exit_code_2(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- collisions
+@pytest.mark.slow
 def test_collisions_go_in_chunks_and_are_the_same_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -66,6 +66,7 @@ def test_its_nodes_have_the_constraints_of_a_follow_through(biped_transcription:
     assert not any("abort" in before.constraint_name(i) for i in range(before.m))
 
 
+@pytest.mark.slow
 def test_the_punch_into_the_air_stands(punch: Solution) -> None:
     air = punch.validate(engine="mujoco", perturbation=Perturbation(missing=True))
     assert air.standing, air.fall
@@ -82,6 +83,7 @@ def test_the_punch_into_the_air_stands(punch: Solution) -> None:
     assert np.abs(done - follow).max() > 0.1
 
 
+@pytest.mark.slow
 def test_a_robot_that_hits_does_not_abort(punch: Solution) -> None:
     until = punch.missed_trajectory.contact_end + 0.1  # [s] an abort motion would begin 0.1 s earlier
     motion, scene = (punch.problem.robot, punch.trajectory), scene_of(punch.problem)
@@ -97,6 +99,7 @@ def test_a_robot_that_hits_does_not_abort(punch: Solution) -> None:
     assert np.abs(missing.q[-1] - without.q[-1]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_the_record_keeps_it(punch: Solution, tmp_path: Path) -> None:
     save_record(record_of(punch, problem=PROBLEM.read_text(), problem_path=PROBLEM), tmp_path)
     assert "missed_time" in load_record(tmp_path).arrays

@@ -362,6 +362,7 @@ def barred(free: Solution) -> Solution:
     return solve(dataclasses.replace(free.problem, obstacles=(BAR,)))
 
 
+@pytest.mark.slow
 def test_a_plan_goes_around_what_is_in_its_way(free: Solution, barred: Solution) -> None:
     """Without the bar it goes where that would be, and so it does if the problem says that it may."""
     assert free.status is barred.status is Status.SOLVED
@@ -382,6 +383,7 @@ def test_a_neighbour_starts_with_the_same_rows(barred: Solution) -> None:
     assert set(moved.clearance_constraints) >= set(barred.clearance_constraints)
 
 
+@pytest.mark.slow
 def test_a_solution_is_a_start_in_another_world_too(free: Solution, barred: Solution) -> None:
     """Whose bodies are others, or none."""
     again = solve(free.problem, start=barred)
@@ -399,6 +401,7 @@ def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
     )
 
 
+@pytest.mark.slow
 def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, barred: Solution) -> None:
     problem, x = barred.problem, free.result.x
     margins, t = Margins(problem), program_of(free, problem)
@@ -415,6 +418,7 @@ def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, ba
     assert deepest_penetration(fixed.program, fixed.result.x, margins)[0] <= 0
 
 
+@pytest.mark.slow
 def test_constraints_enter_before_bodies_can_touch(free: Solution) -> None:
     """From a start that is nowhere near the bar, at an iterate at which bodies are apart."""
     free = solve(rod_hammer(free.problem))

@@ -105,6 +105,7 @@ def test_the_estimate_is_the_true_error(functions: None) -> None:
             assert solution.summary()["caution"] in solution.result.message
 
 
+@pytest.mark.slow
 def test_a_coarse_contact_gets_finer_elements_until_it_is_right(functions: None) -> None:
     solution = solve(problem())
     assert solution.status is Status.SOLVED

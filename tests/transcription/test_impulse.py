@@ -201,6 +201,7 @@ def contact_state(plan: Plan) -> tuple[Array, Array, Array]:
     return q, v, c.complete_motion(y[0], after[0], zero, legs)[1]
 
 
+@pytest.mark.slow
 def test_the_planned_impulse_is_that_of_the_effective_mass(solved: Planned) -> None:
     problem, plan = solved.problem, solved.plan
     assert solved.result.status is Status.SOLVED
@@ -235,6 +236,7 @@ def test_it_says_nothing_of_the_collision_that_it_does_not_know(solved: Planned)
     assert solved.plan.scenarios == ()
 
 
+@pytest.mark.slow
 def test_it_is_kept_shown_and_drawn(solved: Planned, tmp_path: Path) -> None:
     solution = Solution(
         problem=solved.problem,

@@ -271,6 +271,7 @@ def check_carried_over(old: Transcription) -> None:
     assert np.count_nonzero(of_rows) == len(same)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_TOP)
 def test_more_nodes_go_together_with(arm_transcription: Transcription, name: str) -> None:
     """The finer program has what the old one had where it was, and is solved from there in fewer steps."""
@@ -317,6 +318,7 @@ def coarse(arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch) ->
     )
 
 
+@pytest.mark.slow
 def test_solve_adds_nodes_where_they_are_missing(coarse: Any) -> None:
     plain, better = solve(coarse, refine=False), solve(coarse)
     assert plain.status is better.status is Status.SOLVED
@@ -360,6 +362,7 @@ def test_nodes_and_clearance_constraints_are_added_together(coarse: Any) -> None
     assert [attempt.kept for attempt in solution.attempts] == [True]
 
 
+@pytest.mark.slow
 def test_bodies_that_are_near_at_the_start_are_kept_apart(
     coarse: Any, arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:

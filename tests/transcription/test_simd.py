@@ -156,6 +156,7 @@ def test_functions_of_other_blocks_have_the_same_loops(cache: Path) -> None:
         np.testing.assert_array_equal(found[function.name()](given), function.map(LANES)(given))
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("mode", [0o700, 0o722])
 def test_loops_that_others_could_have_written_are_not_linked(cache: Path, mode: int) -> None:
@@ -172,6 +173,7 @@ def test_loops_that_others_could_have_written_are_not_linked(cache: Path, mode: 
     assert of_loops(cache) == {loops: content} and loops.stat().st_mode & 0o022 == 0
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_more_places_than_a_short_number_can_name(cache: Path) -> None:
     x, n = ca.SX.sym("x", 70_000), 70_000
@@ -234,6 +236,7 @@ def test_without_a_compiler_an_instance_a_call(cache: Path, monkeypatch: pytest.
         assert compiled(value)["all"] is value
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_program_in_lanes_is_the_program(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All blocks of a small robot's motion."""

@@ -107,6 +107,7 @@ def test_every_constraint_and_every_variable_has_a_unique_name(transcription: Tr
         assert len(set(names)) == count
 
 
+@pytest.mark.slow
 def test_names_on_a_fine_mesh_differ_too(arm_transcription: Transcription) -> None:
     # intervals and elements of less than one per cent, and torques that are variables of each node and stage
     fine = (0.95, *[0.001] * 50)
@@ -202,6 +203,7 @@ def test_middles_are_between_the_breaks() -> None:
 # ---- plans
 
 
+@pytest.mark.slow
 def test_it_solves(solved: Planned) -> None:
     assert solved.result.status is Status.SOLVED
     assert solved.result.max_violation <= 1e-5

@@ -342,6 +342,7 @@ def test_every_figure_has_a_source_that_exists() -> None:
         assert (name if how == "plot" else source) in known[how]
 
 
+@pytest.mark.slow
 def test_figures_of_the_formulas_are_drawn() -> None:
     ((name, picture),) = drawn(["fig3"], lambda text: None)
     assert name == "fig3" and frowns(picture) == []

@@ -413,11 +413,15 @@ def _saved(file: CollisionFile, section: AtContact, record: Record) -> dict[str,
 
 
 def _joints(collision: Collision, robot: Robot, limit: Array) -> list[dict[str, Any]]:
-    """Largest torque demand and limit [N m] of each joint, by decreasing ratio."""
+    """Largest torque demand and limit of each joint, in its `unit`, by decreasing ratio."""
     if collision.demand is None:
         return []
-    peaks = zip(robot.joint_names, np.abs(collision.demand).max(axis=0), limit, strict=True)
-    rows = [{"joint": j, "torque_Nm": tau, "limit_Nm": most, "ratio": tau / most} for j, tau, most in peaks]
+    units = np.where(robot.prismatic, "N", "N m").tolist()
+    peaks = zip(robot.joint_names, units, np.abs(collision.demand).max(axis=0), limit, strict=True)
+    rows = [
+        {"joint": joint, "unit": unit, "torque_Nm": tau, "limit_Nm": most, "ratio": tau / most}
+        for joint, unit, tau, most in peaks
+    ]
     return sorted(rows, key=lambda row: -row["ratio"])
 
 

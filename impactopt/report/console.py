@@ -221,9 +221,11 @@ def _empty(title: str, *columns: str, left: Collection[str] = ("",), fold: bool 
 
 def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
     """Table of the largest torque demands; `joints` as in `impactopt collide --json`."""
-    columns = ("joint", "torque [N m]", "limit [N m]", "ratio")
+    shown = joints[:most]
+    unit = " or ".join(sorted({str(joint["unit"]) for joint in shown}, reverse=True))
+    columns = ("joint", f"torque [{unit}]", f"limit [{unit}]", "ratio")
     table = _empty("largest torque demands", *columns, left=("joint",))
-    for joint in joints[:most]:
+    for joint in shown:
         numbers = (f"{joint['torque_Nm']:.1f}", f"{joint['limit_Nm']:.1f}", f"{joint['ratio']:.2f}")
         table.add_row(_plain(str(joint["joint"])), *numbers)
     return table

@@ -66,8 +66,8 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         ("motor load / torque-speed line", "motor_ratio", "motor_joint", 2, 1.0),
         ("cut by the motor's line [ms]", "motor_cut_ms", "motor_cut_joint", 1, 0.0),
         ("power of a motor [W]", "power_W", "power_joint", 0, np.inf),
-        ("joint out of its range [rad]", "beyond_range_rad", "beyond_range", 3, 0.0),
-        ("jump of a joint's speed [rad/s]", "velocity_jump_rad_s", "velocity_jump_joint", 2, np.inf),
+        ("joint out of its range [rad or m]", "beyond_range_rad", "beyond_range", 3, 0.0),
+        ("jump of a joint's speed [rad/s or m/s]", "velocity_jump_rad_s", "velocity_jump_joint", 2, np.inf),
     ):
         row = number_row(label, [source.get(key) for source in sources], digits, most=most)
         if row is not None:  # names get a row of their own: beside the values they would be too wide

@@ -164,6 +164,7 @@ def test_models_agree_on_a_short_blow(file: Path) -> None:
     hardest = found["full"]["joints"][0]
     assert hardest["ratio"] == pytest.approx(found["full"]["torque_ratio"])
     assert hardest["ratio"] == pytest.approx(hardest["torque_Nm"] / hardest["limit_Nm"])
+    assert hardest["unit"] == "N m"
     assert [j["ratio"] for j in found["sdc"]["joints"]] == sorted(
         (j["ratio"] for j in found["sdc"]["joints"]), reverse=True
     )

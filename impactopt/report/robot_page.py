@@ -162,7 +162,7 @@ def _excluded_pairs(
     others = [p for p in known if len(of := {joints[n] for n in p}) == 2 and frozenset(of) not in connected]
     yield "The robot's files, or its disable_collisions, exclude them", _sorted(others)
     _, touching = links.piece_pairs(q, disabled)
-    yield f"They touch in the posture {posture}", _sorted(map(frozenset, touching))
+    yield f"They touch, or nearly, in the posture {posture}", _sorted(map(frozenset, touching))
 
 
 def _sorted(pairs: Iterable[frozenset[str]]) -> list[tuple[str, str]]:

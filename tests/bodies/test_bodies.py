@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.spatial import ConvexHull
 from support import urdfs
 from support.small_plans import arm_problem, biped_problem
@@ -290,6 +291,21 @@ def test_what_touches_in_the_start_posture_may_touch() -> None:
     model = problem.robot.model
     for a, b in bodies.pairs:
         assert model.parents[a] != b and model.parents[b] != a
+
+
+@pytest.mark.parametrize(("apart", "touch"), [(5e-4, True), (2e-3, False)])
+def test_links_that_fit_into_each_other_touch(apart: float, touch: bool) -> None:
+    problem = arm_problem()
+    bodies, pair, q = problem.bodies, max(problem.bodies.pairs), problem.start_posture.copy()
+
+    def distance_at(elbow: float) -> float:
+        q[3] = elbow
+        return bodies.exact(Places.of(problem.robot, q[None], np.zeros(1), np.zeros(1, np.intp)), 0, pair)
+
+    q[3] = brentq(lambda elbow: distance_at(elbow) - apart, 1.2, 3.1)
+    pairs, touching = bodies.links.piece_pairs(q)
+    assert (pair in pairs) != touch
+    assert bool(touching) == touch
 
 
 def test_links_that_may_pass_through_each_other_are_no_pair() -> None:

@@ -815,7 +815,7 @@ def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: floa
         "rise", "base", "lift", "0 0 1", (0, 0, 0.2), (0, 0.4), kind="prismatic", effort=effort
     )
     draft = _drafted(tmp_path, text.replace("</robot>", f"{lift}{rail}</robot>"))
-    assert ("rise cannot lift what it carries" in "".join(draft.said)) == locked
+    assert ("too weak for what it carries (rise)" in "".join(draft.said)) == locked
     assert ("rise" in read_toml(draft.text)["robot"].get("locked_rad", {})) == locked
 
 

@@ -926,6 +926,13 @@ def test_the_root_of_an_arm_needs_no_mass(tmp_path: Path, base: str) -> None:
     assert np.allclose(one, other, rtol=0, atol=1e-12)
 
 
+def test_a_walker_with_a_floating_joint_of_its_own_is_refused_for_that(tmp_path: Path) -> None:
+    free = '<joint name="free" type="floating"><parent link="world"/><child link="trunk"/></joint>'
+    text = urdfs.biped().replace("</robot>", f'<link name="world"/>{free}</robot>')
+    with pytest.raises(InputError, match=r"'free' is floating, and .*; take it and the link before it out$"):
+        _robot(tmp_path, text)
+
+
 def test_the_root_of_a_walker_needs_one(tmp_path: Path) -> None:
     text = re.sub(r'(<link name="trunk">)<inertial>.*?</inertial>', r"\1", urdfs.biped(), count=1)
     with pytest.raises(InputError, match=r"root link has no mass.*stands on legs.*--bolted"):

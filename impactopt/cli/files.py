@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem, out_option
+from impactopt.cli.options import ProblemPath, Quiet, Settings, Verbose, complete_problem, out_option
 from impactopt.report.plain_errors import BAD_INPUT, plain_errors, print_json
 
 if TYPE_CHECKING:
@@ -123,6 +123,7 @@ def new(
         typer.Option(help="Draft this motion (default: a kick of a robot without arms, else a punch)."),
     ] = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Print a problem file to start from, with a comment on each key; without a name, list the problems.
 
@@ -142,12 +143,16 @@ def new(
                 raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint=option)
         if reference and as_json:
             raise typer.BadParameter("the reference is Markdown; leave --json out", param_hint="--json")
+        from impactopt.errors import InputError
+
+        if out is not None and out.exists():  # before a draft, which takes a while
+            raise InputError(f"there is a file {out} already; give another --out, or delete it")
         if reference:
             from impactopt.files.problem_file.reference import reference as page
 
             _give(page(), out)
         elif urdf is not None or mjcf is not None:
-            _draft(str(mjcf if urdf is None else urdf), urdf is None, bolted, motion, out, as_json)
+            _draft(str(mjcf if urdf is None else urdf), urdf is None, bolted, motion, out, as_json, quiet)
         elif name is not None:
             from impactopt.files.problem_file.reference import problem_template
 
@@ -159,7 +164,7 @@ def new(
 
 
 def _draft(
-    given: str, mjcf: bool, bolted: bool, motion: Motion | None, out: Path | None, as_json: bool
+    given: str, mjcf: bool, bolted: bool, motion: Motion | None, out: Path | None, as_json: bool, quiet: bool
 ) -> None:
     from rich.console import Console
 
@@ -170,7 +175,7 @@ def _draft(
 
     path = Path(given) if mjcf else find_description(given)
     folder = Path() if out is None else out.parent
-    with SolveConsole(Console(stderr=True)) as progress:
+    with SolveConsole(Console(stderr=True), quiet=quiet) as progress:
         draft = draft_problem(
             path, folder=folder, mjcf=mjcf, bolted=bolted, motion=motion, report=progress.say
         )
@@ -189,8 +194,6 @@ def _give(text: str, out: Path | None, as_json: bool = False) -> None:
     from impactopt.files.toml import read_toml
 
     if out is not None:
-        if out.exists():
-            raise InputError(f"there is a file {out} already; give another --out, or delete it")
         try:
             write_atomically(out, lambda file: file.write(text.encode()))
         except OSError as error:

@@ -56,7 +56,13 @@ def problem_summary(name: str) -> str:
 
 
 def _file(name: str | os.PathLike[str], named: Mapping[str, Path], kind: str) -> Path:
-    path = Path(name)
+    try:
+        path = Path(name)
+    except TypeError:
+        raise InputError(
+            f"a {kind} is given by its name or its file, and this is of type {type(name).__name__}; "
+            "`write_problem` gives the text of a problem's file"
+        ) from None
     if path.suffix or len(path.parts) != 1 or is_plain_file(path):
         return path
     if path.name not in named:

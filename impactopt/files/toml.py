@@ -173,4 +173,4 @@ def _value(value: Any) -> str:
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items()) + "}"
-    raise TOMLError(f"{value!r} is a {type(value).__name__}, which TOML does not have")
+    raise TOMLError(f"{value!r} is of type {type(value).__name__}, which TOML does not have")

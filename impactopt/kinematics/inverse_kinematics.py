@@ -158,7 +158,7 @@ def inverse_kinematics(
                 hand = np.reshape(hand, (6, model.nv))  # Pinocchio drops an axis if nv is 1
                 jacs.append(hand[:3])
             off = float(np.abs(np.concatenate(errors)).max())
-            best_gap = min(best_gap, off)
+            best_gap = min(best_gap, max(float(np.linalg.norm(error)) for error in errors))
             orienting = facing is not None and iteration < FACING_STEPS
             if off < tolerance and (not orienting or np.abs(step).max() < FACING_STEP):
                 return q

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from impactopt.contact.fields import abouts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone
 
@@ -82,6 +82,7 @@ class LatestRequest(Generic[Request, Outcome]):
 _RANGE = 4.0  # factor from a parameter's value in the problem to the ends of its slider
 _STEPS = 200  # of a slider
 _MARGIN = 0.06  # [m] end of the slider for the ZMP's margin, or more
+_PREFIXES = {"M": 1e6, "k": 1e3, "": 1.0}  # the page's number fields show five digits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +90,7 @@ class SliderParameter:
     """Parameter of a problem with a slider.
 
     name : as an argument of `Solution.moved`.  label : with the unit.  value, least, most, step : in that
-    unit.
+    unit.  scale : that unit in SI.
     """
 
     name: str
@@ -98,13 +99,14 @@ class SliderParameter:
     least: float
     most: float
     step: float
+    scale: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanRequest:
     """Request of a plan.
 
-    point [m] : hit point.  parameters : names and values of the sliders.
+    point [m] : hit point.  parameters : names and values of the sliders, in their units.
     """
 
     point: tuple[float, float, float]
@@ -112,9 +114,10 @@ class PlanRequest:
 
     def changes(self, problem: ImpactProblem) -> dict[str, Any]:
         """Differences from a problem, as arguments of `Solution.moved`."""
-        own = request_of(problem)
+        own, scales = request_of(problem), {p.name: p.scale for p in slider_parameters(problem)}
         out: dict[str, Any] = {} if self.point == own.point else {"point": np.array(self.point)}
-        return out | dict(sorted(set(self.parameters) - set(own.parameters)))
+        changed = sorted(set(self.parameters) - set(own.parameters))
+        return out | {name: value * scales[name] for name, value in changed}
 
 
 def request_of(problem: ImpactProblem) -> PlanRequest:
@@ -129,16 +132,18 @@ def slider_parameters(problem: ImpactProblem) -> tuple[SliderParameter, ...]:
     the problem has.
     """
     found = []
-    parts: tuple[tuple[str, str, Any], ...] = (
-        ("mass", "target's mass", problem.target),
-        ("stiffness", "contact's stiffness", problem.law),
+    parts: tuple[tuple[str, str, Any, dict[str, float]], ...] = (
+        ("mass", "target's mass", problem.target, {"": 1.0}),
+        ("stiffness", "contact's stiffness", problem.law, _PREFIXES),
     )
-    for name, what, thing in parts:
-        for field in dataclasses.fields(thing):
+    for name, what, thing, prefixes in parts:
+        for field, about in abouts(type(thing)):
             if field.name == name:
                 value = float(getattr(thing, name))
-                unit = field.metadata["about"].unit
-                found.append(_between(name, f"{what} [{unit}]", value, value / _RANGE, value * _RANGE))
+                prefix = next((key for key, scale in prefixes.items() if value >= scale), "")
+                scale, label = prefixes[prefix], f"{what} [{prefix}{about.unit}]"
+                value /= scale
+                found.append(_between(name, label, value, value / _RANGE, value * _RANGE, scale))
     if problem.coordinates.legs:
         margin = 1e3 * problem.term(ContactWrenchCone).margin
         found.append(
@@ -147,6 +152,10 @@ def slider_parameters(problem: ImpactProblem) -> tuple[SliderParameter, ...]:
     return tuple(found)
 
 
-def _between(name: str, label: str, value: float, least: float, most: float) -> SliderParameter:
+def _between(
+    name: str, label: str, value: float, least: float, most: float, scale: float = 1.0
+) -> SliderParameter:
     step = (most - least) / _STEPS
-    return SliderParameter(name=name, label=label, value=value, least=least, most=most, step=step)
+    return SliderParameter(
+        name=name, label=label, value=value, least=least, most=most, step=step, scale=scale
+    )

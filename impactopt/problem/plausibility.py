@@ -17,6 +17,8 @@ from impactopt.robots.robot import Robot
 
 GIANT = 3.0  # length of a sole over that of its leg: no sole is so long
 LIGHTEST = 1e-3  # [kg] of a link whose inertia is doubted
+LARGEST = 50.0  # [m] between the joints of a limb, summed: a finger of 5 cm in millimetres
+MOST_TURNS = 4  # to each side, of a joint with limits; ten degrees in place of radians are more than one
 ALIKE = 0.2  # relative difference of left and right soles in length or width that is no doubt
 
 
@@ -25,10 +27,17 @@ def doubts(robot: Robot) -> list[str]:
     return [
         *_without_armature(robot),
         *_armatures(robot),
-        *light_links(robot),
+        *unit_doubts(robot),
         *_sides(robot),
         *shape_doubts(robot),
     ]
+
+
+def unit_doubts(robot: Robot) -> Iterator[str]:
+    """Messages about lengths, angles and inertias that are plausible in other units only."""
+    yield from _giant(robot)
+    yield from _in_degrees(robot)
+    yield from _light_links(robot)
 
 
 def giant_soles(robot: Robot) -> Iterator[str]:
@@ -44,6 +53,33 @@ def giant_soles(robot: Robot) -> Iterator[str]:
                 f"sole {sole.name!r} is {size:.3g} m long, on a leg of {leg:.2g} m: are its "
                 "corners in millimetres? Give them in metres"
             )
+
+
+def _giant(robot: Robot) -> Iterator[str]:
+    """Message about a robot far larger than any, as when millimetres are taken for metres."""
+    model = robot.model
+    length = max(
+        sum(float(np.linalg.norm(model.jointPlacements[j].translation)) for j in chain)
+        for chain in model.supports
+    )
+    if length > LARGEST:
+        yield (
+            f"the longest limb of {robot.name} measures {length:.3g} m from joint to joint: is its file in "
+            "millimetres? Give lengths in metres"
+        )
+
+
+def _in_degrees(robot: Robot) -> Iterator[str]:
+    """Message about limits of angles that are as large as degrees, and no more than a few turns of them."""
+    widest = np.maximum(np.abs(robot.lower), np.abs(robot.upper))
+    doubtful = (widest > MOST_TURNS * 2 * np.pi) & (widest <= 720.0) & ~robot.prismatic
+    names = [name for name, doubt in zip(robot.joint_names, doubtful, strict=True) if doubt]
+    if names:
+        k = robot.joint_index(names[0])
+        yield (
+            f"position limits of {_counted(names)}: {robot.lower[k]:.4g} to {robot.upper[k]:.4g} rad are "
+            "hard to believe: are they in degrees? Give them in radians"
+        )
 
 
 def _without_armature(robot: Robot) -> Iterator[str]:
@@ -81,7 +117,7 @@ def _armatures(robot: Robot) -> Iterator[str]:
             )
 
 
-def light_links(robot: Robot) -> Iterator[str]:
+def _light_links(robot: Robot) -> Iterator[str]:
     """Message about links whose inertia is that of a body lighter than any robot's."""
     model, sizes = robot.model, dict[str, tuple[float, float]]()
     for name, body in zip(list(model.names)[1:], list(model.inertias)[1:], strict=True):

@@ -153,6 +153,7 @@ class _Charts:
         soles = footprints(self.record)
         self.arrays |= {f"ground_{name}": corners for name, corners in soles.items()}
         self.arrays["ground_polygon"] = self.record.arrays["polygon"]
+        contact = " The polygon is that at contact." if self.record.summary.get("stances") else ""
         return {
             "kind": "ground",
             "title": "ZMP in the support polygon",
@@ -162,7 +163,7 @@ class _Charts:
             "polygon": "ground_polygon",
             "soles": [f"ground_{name}" for name in soles],
             "height": 300,
-            "note": "From above; drag to move. The dots show the ZMP at the time of the animation.",
+            "note": f"From above; drag to move. The dots show the ZMP at the time of the animation.{contact}",
         }
 
     def _torque(self) -> list[tuple[str, Array, Array]]:

@@ -110,7 +110,7 @@ def _cards(s: Mapping[str, Any]) -> str:
     if margins:
         least = min(min(phases.values()) for phases in margins.values())
         required = min((s.get("sole_cop_margin_asked_mm") or {}).values(), default=None)
-        beside = "" if required is None else f", {required:g}{NARROW}mm required"
+        beside = "" if required is None else f", {required:g}{NARROW}mm required at nodes"
         kind = "bad" if shortfalls(s) else ""
         card(f"{least:.0f} mm", f"least planned margin of a sole's centre of pressure{beside}", kind)
     standing = s.get("replayed", {}).get("standing")

@@ -50,7 +50,7 @@ def read_urdf(
             f"{urdf} is a xacro file, not yet a URDF: run `xacro {Path(urdf).name} > robot.urdf`, and give "
             "robot.urdf"
         )
-    _check_limits(root, urdf)
+    _check_joints(root, urdf)
     try:
         if _without_negative_limits(root):
             model = pin.buildModelFromXML(tostring(root, encoding="unicode"), *joints)
@@ -89,21 +89,24 @@ def _parsed(urdf: str) -> Element:
     return tree.close()
 
 
-def _check_limits(root: Element, urdf: str) -> None:
-    """InputError with all joints that lack a limit of effort or velocity, without which no URDF is read."""
+def _check_joints(root: Element, urdf: str) -> None:
+    """InputError with all joints that lack a limit of effort or velocity, without which no URDF is read, and
+    with those whose axis is zero, which Pinocchio reads as joints that move nothing.
+    """
     found = Mistakes()
     for joint in root.findall("joint"):
         limits, kind = joint.findall("limit"), joint.get("type", "")
+        name = f"URDF {urdf}: joint {joint.get('name', '')!r}"
         if limits:
             lacks = [key for key in ("effort", "velocity") if not limits[0].get(key, "")]
         else:
             lacks = ["effort", "velocity"] if kind in ("revolute", "prismatic") else []
         if lacks:
             keys = " and ".join(lacks)
-            found.found.append(
-                f"URDF {urdf}: joint {joint.get('name', '')!r} has no {keys} in a <limit>; give {keys} "
-                "there, 0 if unknown"
-            )
+            found.found.append(f"{name} has no {keys} in a <limit>; give {keys} there, 0 if unknown")
+        axis = " ".join(axis.get("xyz", "") for axis in joint.findall("axis")).split()
+        if kind in ("revolute", "continuous", "prismatic") and axis and not any(map(_urdf_number, axis)):
+            found.found.append(f"{name} has the axis {' '.join(axis)}; give its direction, as 0 0 1")
     found.raise_if_any(f"URDF {urdf}")
 
 

@@ -311,10 +311,11 @@ def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = 
     """Sweep of a file's data; see `parse_sweep`."""
     try:
         check_plain(data)
+        plain: dict[str, Any] = plain_value(data)
+        text = _written(plain)
     except TOMLError as error:
         raise InputError(f"{where}: {error}") from error
-    plain: dict[str, Any] = plain_value(data)
-    return _checked(plain, Path(where), _written(plain), {})
+    return _checked(plain, Path(where), text, {})
 
 
 def _written(data: Mapping[str, Any]) -> str:

@@ -396,6 +396,24 @@ def test_success_has_one_key_in_json() -> None:
     assert found["ok"] is True
 
 
+def test_a_draft_is_quiet_if_asked_and_never_made_for_a_file_that_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drafted(*_: Any, report: Any, **__: Any) -> None:
+        report("trying strikes")
+        raise InputError("no posture is found")
+
+    monkeypatch.setattr("impactopt.files.draft.drafting.draft_problem", drafted)
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text("<robot/>")
+    for option, said in (("--json", True), ("-q", False)):
+        told = run("new", "--urdf", urdf, "--out", tmp_path / "robot.toml", option, code=2)
+        assert ("trying strikes" in "".join(told)) == said
+    (tmp_path / "robot.toml").write_text("")
+    error = run("new", "--urdf", urdf, "--out", tmp_path / "robot.toml", code=2)[1]
+    assert "already; give another --out" in error and "trying strikes" not in error
+
+
 def test_a_new_file_as_json_is_its_text_and_its_tables(tmp_path: Path) -> None:
     text = run("new", "arm_planar")[0]
     told = json.loads(run("new", "arm_planar", "--json")[0])

@@ -834,7 +834,7 @@ def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: floa
         "rise", "base", "lift", "0 0 1", (0, 0, 0.2), (0, 0.4), kind="prismatic", effort=effort
     )
     draft = _drafted(tmp_path, text.replace("</robot>", f"{lift}{rail}</robot>"))
-    assert ("rise cannot lift what it carries" in "".join(draft.said)) == locked
+    assert ("too weak for what it carries (rise)" in "".join(draft.said)) == locked
     assert ("rise" in read_toml(draft.text)["robot"].get("locked_rad", {})) == locked
 
 
@@ -944,6 +944,13 @@ def test_the_root_of_an_arm_needs_no_mass(tmp_path: Path, base: str) -> None:
     q = np.linspace(0.3, 0.9, heavy.model.nq)
     one, other = (pin.crba(r.model, r.model.createData(), q) for r in (light, heavy))
     assert np.allclose(one, other, rtol=0, atol=1e-12)
+
+
+def test_a_walker_with_a_floating_joint_of_its_own_is_refused_for_that(tmp_path: Path) -> None:
+    free = '<joint name="free" type="floating"><parent link="world"/><child link="trunk"/></joint>'
+    text = urdfs.biped().replace("</robot>", f'<link name="world"/>{free}</robot>')
+    with pytest.raises(InputError, match=r"'free' is floating, and .*; take it and the link before it out$"):
+        _robot(tmp_path, text)
 
 
 def test_the_root_of_a_walker_needs_one(tmp_path: Path) -> None:

@@ -533,3 +533,14 @@ def test_out_of_reach_says_how_far_off() -> None:
     case = made("arm")
     with pytest.raises(InputError, match=r"out of reach of 'hand': .*off by .*starts at"):
         inverse_kinematics(case.c, "hand", np.array([2.0, 0.0, 0.5]), case.posture)
+
+
+def test_out_of_reach_is_a_distance_and_not_its_largest_component() -> None:
+    robot = load_robot("planar_arm")  # its shoulder is at 0.6 m
+    c, posture = StanceCoordinates(robot, (), robot.posture("ready")), robot.posture("ready")
+    reach = 0.4 + 0.36 + np.hypot(0.05, 0.33)
+    point = np.array([0.0, 0.0, 0.6]) + (reach + 0.5) * np.array([0.6, 0.0, 0.8])
+    with pytest.raises(InputError) as error:
+        inverse_kinematics(c, "hammer", point, posture)
+    off = float(str(error.value).partition("off by ")[2].split(" m")[0])
+    assert off == pytest.approx(0.5, abs=0.01)

@@ -30,6 +30,7 @@ from impactopt import (
     InputError,
     RigidWall,
     Solution,
+    SpringDamper,
     Status,
     load_problem,
     load_record,
@@ -132,7 +133,7 @@ def test_a_fault_of_ours_is_told_and_leaves_the_old_plan(
         raise ZeroDivisionError("by nothing")
 
     monkeypatch.setattr("impactopt.live.replanning.moved_solution", broken)
-    look.sliders["stiffness"].value = 1.1 * arm.problem.law.stiffness
+    look.sliders["stiffness"].value *= 1.1
     assert look.wait(LONG)
     assert look.answer.solution is arm
     assert "by nothing" in look.status.content
@@ -188,6 +189,13 @@ def test_a_legged_robot_has_a_margin_and_a_wall_no_mass(arm: Solution) -> None:
     for number in slider_parameters(biped):
         assert number.least < number.value < number.most
     assert request_of(biped).changes(biped) == {}
+    for stiffness, shown, unit in ((900.0, 900.0, "N/m"), (5e4, 50.0, "kN/m"), (3e8, 300.0, "MN/m")):
+        law = SpringDamper(stiffness=stiffness, damping=1.0)
+        stiff = dataclasses.replace(biped, law=law)
+        slider = next(n for n in slider_parameters(stiff) if n.name == "stiffness")
+        assert (slider.value, slider.label) == (shown, f"contact's stiffness [{unit}]")
+        request = PlanRequest(point=request_of(stiff).point, parameters=(("stiffness", slider.most),))
+        assert request.changes(stiff) == {"stiffness": pytest.approx(4 * stiffness)}
     other = PlanRequest(point=(0.0, 0.0, 1.0), parameters=(("mass", 3.0), ("margin", 0.01)))
     assert list(other.changes(biped)) == ["point", "margin"]
 

@@ -44,6 +44,25 @@ def test_armatures_that_no_drive_has_are_doubted(value: float, word: str) -> Non
     assert word in told and f"{value:.2g} kg m2" in told and "rotor inertia x gear ratio^2" in told
 
 
+def test_a_robot_in_millimetres_is_doubted() -> None:
+    robot = planar_arm()
+    model = robot.model.copy()
+    for j in range(1, model.njoints):
+        model.jointPlacements[j] = pin.SE3(np.eye(3), 1e3 * model.jointPlacements[j].translation)
+    assert any(
+        "millimetres? Give lengths in metres" in text
+        for text in doubts(dataclasses.replace(robot, model=model))
+    )
+
+
+def test_limits_in_degrees_are_doubted() -> None:
+    robot = planar_arm()
+    wrong = dataclasses.replace(robot, upper=np.rad2deg(robot.upper))
+    told = [text for text in doubts(wrong) if "in degrees?" in text]
+    assert len(told) == 1
+    assert told[0].startswith("position limits of shoulder and 2 more joints: -2.6 to 149 rad are hard to")
+
+
 def test_the_inertia_of_a_body_lighter_than_foam_is_doubted() -> None:
     robot = planar_arm()
     model = robot.model.copy()

@@ -98,6 +98,14 @@ def test_limits_that_a_urdf_must_have_are_named_for_all_joints(tmp_path: Path) -
     assert lacks == ["effort", "effort and velocity"]
 
 
+def test_a_joint_whose_axis_is_zero_is_named(tmp_path: Path) -> None:
+    """Pinocchio reads it, and it moves nothing."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdfs.arm().replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>'))
+    with pytest.raises(InputError, match=r"'turn' has the axis 0 0 0; give its direction"):
+        Robot.from_urdf(path, floating=False)
+
+
 def test_repairs_have_to_be_said_and_are_listed(tmp_path: Path) -> None:
     path = tmp_path / "walker.urdf"
     path.write_text(urdfs.biped(moments=LOST))

@@ -23,6 +23,7 @@ from impactopt import (
     SpringDamper,
     collide_many,
     holding_torque,
+    load_problem,
     load_robot,
     space_arm,
     striking_velocity,
@@ -33,6 +34,7 @@ from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin
+from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.collisions import Collisions
 
 POINT, NORMAL = [0.7, 0.0, 0.75], np.array([0.0, 0.0, -1.0])
@@ -430,6 +432,15 @@ def test_mistakes_are_told_before_work_starts(
 ) -> None:
     with pytest.raises(InputError, match=says):
         collide_many(arm_file(), columns, at_contact={"speed_m_s": 1.0, **at_contact})
+
+
+def test_a_problem_in_python_is_no_file() -> None:
+    problem: Any = load_problem("arm_planar")
+    with pytest.raises(InputError, match="this is of type ImpactProblem; `write_problem`"):
+        collide_many(problem, {"target.mass": [1.0]})
+    given = {"sweep": {"problem": problem, "case_kind": "strike"}, "grid": {"target.mass": [1.0]}}
+    with pytest.raises(InputError, match="is of type ImpactProblem, which TOML does not have"):
+        sweep_from_data(given)
 
 
 def test_mistakes_in_what_is_asked_for() -> None:

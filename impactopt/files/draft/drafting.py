@@ -36,7 +36,7 @@ from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import StrikeSolution, optimize_strike
 from impactopt.problem.feasibility import hopeless, too_weak
-from impactopt.problem.plausibility import light_links, shape_doubts
+from impactopt.problem.plausibility import shape_doubts, unit_doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import DOWN, touches
 from impactopt.problem.terms import Slide
@@ -591,10 +591,10 @@ def robot_kind(drafted: Drafted) -> str:
 
 
 def _reasons(locked: Mapping[str, str]) -> Iterator[str]:
-    """Reasons for locked joints, each once with its count."""
+    """Reasons for locked joints, each once with its joint or their count."""
     for reason in dict.fromkeys(locked.values()):
-        count = sum(other == reason for other in locked.values())
-        yield f"{reason}" if count == 1 else f"{reason} ({count} joints)"
+        names = [name for name, other in locked.items() if other == reason]
+        yield f"{reason} ({names[0] if len(names) == 1 else counted(len(names), 'joint')})"
 
 
 def _frames(robot: Robot) -> Iterator[str]:
@@ -624,7 +624,7 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
                 f"sole {sole.name!r} has a leg of five joints: the foot may turn on it about {sole.hinge}, "
                 f"by {sole.hinge_range:g} rad, and it transmits no moment about that axis"
             )
-    yield from light_links(robot)
+    yield from unit_doubts(robot)
     yield from shape_doubts(robot)
     if drafted.locked:
         yield f"locked: {'; '.join(_reasons(drafted.locked))}"

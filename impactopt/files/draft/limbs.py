@@ -92,7 +92,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
         elif mass[j] <= 0:
             out[name] = "no mass"
         elif "JointModelP" in joint.shortname() and effort[joint.idx_v] < weight[joint.idx_v]:
-            out[name] = f"{name} cannot lift what it carries"
+            out[name] = "too weak for what it carries"
         elif "JointModelP" in joint.shortname() and high - low > TRAVEL:
             # what turns such a slide, or turns on it without a limit, steers the base
             steering = [i for i in model.supports[j] if i >= first]

@@ -194,14 +194,17 @@ def _check_bolted(first: Description, found: Drafted, ties: Sequence[Tie]) -> No
     first : with a free-flyer.  found : without.  ties : that it has with a free-flyer only; if there are
         none, the root has no mass.
     """
-    what, fix = "the root link has no mass", "give it an <inertial>"
+    what, fix = "the root link has no mass", "give it an <inertial>, or bolt it to the ground (--bolted)"
+    free = [
+        str(name) for name, joint in zip(first.model.names, first.model.joints, strict=True) if joint.nv > 1
+    ]
+    if len(free) > 1:
+        what, fix = f"joint {free[1]!r} is floating", "take it and the link before it out"
     if ties:
-        what, fix = ties[0].text, ties[0].fix
+        what, fix = ties[0].text, f"{ties[0].fix}, or bolt it to the ground (--bolted)"
     model = lock_joints(first.model, found.options["locked"])
     if legs_of(model, {joint + 1: pieces for joint, pieces in found.pieces.items()}):
-        raise InputError(
-            f"{found.path}: {what}, and the robot stands on legs; {fix}, or bolt it to the ground (--bolted)"
-        )
+        raise InputError(f"{found.path}: {what}, and the robot stands on legs; {fix}")
 
 
 def _read(path: Path, mjcf: bool, floating: bool | None, locked: Collection[str] = ()) -> Description:

@@ -92,9 +92,10 @@ def _zmp_paths(record: Record) -> dict[tuple[str, int], tuple[Array, Array]]:
 
 def _zmp_key(record: Record) -> list[Line2D | Patch]:
     grey = matplotlib.colormaps["cividis"](0.5)
+    polygon = "support polygon at contact" if record.summary.get("stances") else "support polygon"
     key: list[Line2D | Patch] = [
         Line2D([], [], linestyle="", marker="o", color=grey, markeredgecolor=BLACK, label="planned"),
-        Line2D([], [], linestyle="--", color=BLACK, linewidth=1.0, label="support polygon"),
+        Line2D([], [], linestyle="--", color=BLACK, linewidth=1.0, label=polygon),
         Patch(facecolor="#eeeeee", edgecolor="#999999", label="sole"),
     ]
     if record.simulated:

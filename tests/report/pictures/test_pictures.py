@@ -26,6 +26,7 @@ from impactopt import Ground, InputError, Solution, effective_mass
 from impactopt.files.output import record_of
 from impactopt.files.record import Record
 from impactopt.kinematics.support import zmp
+from impactopt.report.charts import charts_of
 from impactopt.report.pictures import PICTURES, hierarchy, overview
 from impactopt.report.pictures.ellipsoid import effective_masses
 from impactopt.report.pictures.style import DPI, PAGE, Picture
@@ -121,6 +122,18 @@ def test_a_picture_is_sharp_and_as_large_as_it_says(punch_record: Record) -> Non
 
 
 # ---------------------------------------------------------------- what is drawn
+def test_the_polygon_of_a_plan_with_steps_is_that_at_contact(punch_record: Record) -> None:
+    end = float(punch_record.arrays["reference_time"][-1])
+    stances = [{"soles": ["left", "right"], "from_s": 0.0, "to_s": end}]
+    stepping = dataclasses.replace(punch_record, summary={**punch_record.summary, "stances": stances})
+    for record, name in ((punch_record, "support polygon"), (stepping, "support polygon at contact")):
+        picture = PICTURES["zmp"](record)
+        assert picture is not None
+        assert name in [text.get_text() for text in picture.legends[0].get_texts()]
+        notes = "".join(chart.get("note", "") for chart in charts_of(record)[0])
+        assert ("The polygon is that at contact." in notes) == (record is stepping)
+
+
 def test_the_force_is_the_plans_and_the_simulations(punch_record: Record) -> None:
     a, picture = punch_record.arrays, PICTURES["force"](punch_record)
     assert picture is not None

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from support.small_motions import scene, standing, standing_on_left
+from support.small_motions import blow_motion, scene, standing, standing_on_left
 from support.small_robots import arm, biped
 
 from impactopt import InputError, Perturbation, Robot
@@ -294,6 +294,19 @@ def test_it_stands_after_a_push_that_the_servo_does_not_survive() -> None:
     assert not stand(pushed).standing
     done = stand(pushed, ControllerSettings())
     assert done.standing, done.fall
+
+
+def test_noise_of_the_force_sensor_is_no_contact() -> None:
+    """With five times the noise a hand hits about as hard; the reference after the impact would stop it."""
+    robot, motion, where = blow_motion()
+    slope = np.gradient(motion.v, motion.time, axis=0)
+    ref = SimpleNamespace(**(vars(motion) | {"a": slope, "contact_start": 0.2, "contact_end": 0.25}))
+    impulses = []
+    for noise in (0.0, 5.0):
+        settings = ControllerSettings(noise=noise, follow="plan")
+        done = simulate_mujoco(robot, ref, where, step=1e-3, until=0.35, controller=settings)
+        impulses.append(done.impulse)
+    assert impulses[1] == pytest.approx(impulses[0], rel=0.2)
 
 
 def test_an_arm_on_a_fixed_base_follows_too() -> None:

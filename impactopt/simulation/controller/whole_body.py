@@ -242,7 +242,6 @@ class WrenchCones:
 PROJECTION_WINDOW = 0.01  # [s] before and after the impact in which velocity errors are projected
 FORCE_FILTER = 3e-3  # [s] time constant of the low-pass filter of the striking force
 MAX_LEAST_LOAD = 0.25  # of the weight, that all soles together carry at least
-CONTACT_FORCE = 20.0  # [N] that counts as contact: ten times the noise of the sensor
 MOMENT_ARM = 0.1  # [m] that makes the moments of a sole comparable with its forces
 RECOVERY_TORQUE_WEIGHT = 1e-3  # of torques over their limits; the recovery has no feed-forward to follow
 MIN_TORQUE_WEIGHT = 1e-6  # the tasks alone may leave torques free, and the Hessian has to be regular
@@ -371,7 +370,7 @@ class WholeBodyController:
         self.striking_force += (1 - math.exp(-s.period / FORCE_FILTER)) * (
             measured.forces - self.striking_force
         )
-        self.tracking.update_contact(t, bool((measured.forces > CONTACT_FORCE).any()))
+        self.tracking.update_contact(t, bool((measured.forces > self.sensors.contact_force).any()))
         aim = self.tracking.at(t + delay)
         dynamics = self.stance_problem.dynamics
         dynamics.update(q, rates, self.striking_force, s.sole_bandwidth)

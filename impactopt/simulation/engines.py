@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -186,17 +187,20 @@ def longest_stable_step(
 def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any) -> Simulation:
     """Simulation by an engine, with an estimate of its impulse's error by the steps.
 
-    The step is at most that of `longest_stable_step`. The impulse up to the end of the impact is compared
-    with that of a simulation with twice the step, or, if the given step is longer than the engine's default,
-    with the default. If the error is above 1 %, or the simulation diverges, the step is halved, at most three
-    times; a given step longer than the default is kept.
+    The step is at most that of `longest_stable_step`, and divides a controller's own period, as it is else
+    sampled at another rate. The impulse up to the end of the impact is compared with that of a
+    simulation with twice the step, or, if the given step is longer than the engine's default, with the
+    default. If the error is above 1 %, or the simulation diverges, the step is halved, at most three times; a
+    given step longer than the default is kept.
     """
     # the default of the engine's signature
     own = float((run.__kwdefaults__ or {})["step"])
-    longest = longest_stable_step(
-        *given, perturbation=options.get("perturbation"), controller=options.get("controller")
-    )
+    controller, world = options.get("controller"), options.get("perturbation") or Perturbation()
+    longest = longest_stable_step(*given, perturbation=world, controller=controller)
     step = min(float(options.pop("step", own)), longest)
+    if controller is not None and not world.period:
+        period = controller.period
+        longest, step = min(longest, period), period / math.ceil((1 - 1e-9) * period / step)
     for left in range(HALVINGS, -1, -1):
         try:
             simulation = run(*given, **options, step=step)

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from support.small_motions import scene, standing, standing_on_left
+from support.small_motions import blow_motion, scene, standing, standing_on_left
 from support.small_robots import arm, biped
 
 from impactopt import InputError, Perturbation, Robot
@@ -269,12 +269,46 @@ def test_it_stands_still_with_noise_and_delay() -> None:
     assert done.posture_error < 0.02
 
 
+def test_a_robot_of_a_kilogram_stands_as_a_heavy_one_does() -> None:
+    """Its soles cannot bear the least force of a heavy robot's; all motions scale with the mass."""
+    heavy, part = biped(), 0.02
+    model = heavy.model.copy()
+    for j, inertia in enumerate(heavy.model.inertias):
+        model.inertias[j] = pin.Inertia(part * inertia.mass, inertia.lever, part * inertia.inertia)
+    model.armature = part * np.array(heavy.model.armature)
+    gains = {name: part * getattr(heavy, name) for name in ("kp", "kd", "torque_limit")}
+    moved = []
+    for robot in (heavy, replace(heavy, model=model, **gains)):
+        done = simulate_mujoco(robot, *still(robot), step=1e-3, settle=0.0, until=0.3, controller=QUIET)
+        moved.append(done.q[-1] - done.q[0])
+    np.testing.assert_allclose(moved[1], moved[0], atol=1e-8)
+
+
+def test_it_stands_without_a_weight_of_torques_posture_and_wrenches() -> None:
+    """Torques that no task determines are the plan's."""
+    done = stand(settings=replace(QUIET, torque=0.0, posture=0.0, wrench=0.0))
+    assert done.standing, done.fall
+
+
 @pytest.mark.slow
 def test_it_stands_after_a_push_that_the_servo_does_not_survive() -> None:
     pushed = Perturbation(push=90.0, push_start=0.1, push_time=0.1, period=1e-3)
     assert not stand(pushed).standing
     done = stand(pushed, ControllerSettings())
     assert done.standing, done.fall
+
+
+def test_noise_of_the_force_sensor_is_no_contact() -> None:
+    """With five times the noise a hand hits about as hard; the reference after the impact would stop it."""
+    robot, motion, where = blow_motion()
+    slope = np.gradient(motion.v, motion.time, axis=0)
+    ref = SimpleNamespace(**(vars(motion) | {"a": slope, "contact_start": 0.2, "contact_end": 0.25}))
+    impulses = []
+    for noise in (0.0, 5.0):
+        settings = ControllerSettings(noise=noise, follow="plan")
+        done = simulate_mujoco(robot, ref, where, step=1e-3, until=0.35, controller=settings)
+        impulses.append(done.impulse)
+    assert impulses[1] == pytest.approx(impulses[0], rel=0.2)
 
 
 def test_an_arm_on_a_fixed_base_follows_too() -> None:

@@ -40,6 +40,7 @@ from impactopt import (
 from impactopt.bodies.clearance import Places
 from impactopt.report.console import replay_table
 from impactopt.simulation import (
+    ControllerSettings,
     Scene,
     Simulation,
     robustness,
@@ -456,3 +457,18 @@ def test_a_servo_that_is_sampled_needs_no_shorter_steps_than_its_period() -> Non
     assert longest_stable_step(slider(1.0, kp=400.0), *given[1:]) == pytest.approx(1 / 20)
     with pytest.raises(InputError, match=r"servo has a rate of .* 1/s, too fast"):
         longest_stable_step(*given, perturbation=Perturbation(kd=100.0))
+
+
+@pytest.mark.parametrize("rate", [1000.0, 3000.0, 10_000.0])
+def test_steps_divide_the_period_of_a_controller(rate: float) -> None:
+    """A controller of 3 kHz would else be sampled with 2.5 kHz, one of 10 kHz with 5 kHz."""
+    robot = arm()
+    q = robot.posture("start")
+    torque = np.array(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))
+    ref = reference([0.0, 0.02], q, torque=torque, nv=robot.nv, n=robot.n)
+    ref.a, ref.contact_start, ref.contact_end = np.zeros((2, robot.nv)), 0.01, 0.015
+    common = {"settle": 0.0, "until": 0.01, "record": 1, "controller": ControllerSettings(rate=rate)}
+    done = with_step_error(simulate_mujoco, robot, ref, scene("striker:hand"), **common)
+    steps = 1 / rate / np.diff(done.time)
+    np.testing.assert_allclose(steps, np.round(steps), rtol=1e-9)
+    assert steps.max() >= 1 - 1e-9

@@ -16,9 +16,9 @@ from impactopt.problem.violation import Measure
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueRate(Term):
-    """|d torque/dt| is bounded, between successive nodes of swing and follow-through.
+    """The mean rate of each torque from one node to the next is bounded, in swing and follow-through.
 
-    If the limit is given by joint, other joints have no bound.
+    Within an interval a torque may change faster. If the limit is by joint, other joints have no bound.
     """
 
     name: ClassVar[str] = "torque rate"

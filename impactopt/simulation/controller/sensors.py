@@ -27,6 +27,7 @@ ORIENTATION_NOISE = np.deg2rad(0.02)  # [rad] from sample to sample
 GYRO_DENSITY = np.deg2rad(0.01)  # [rad/s/sqrt(Hz)]
 GYRO_BIAS = np.deg2rad(10.0 / 3600)  # [rad/s], constant during a replay
 HAND_FORCE = 2.0  # [N] of the wrist's sensor
+CONTACT_DEVIATIONS = 10.0  # standard deviations of a force reading that counts as contact
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,12 @@ class Sensors:
     """Sensors of a robot, with random errors.
 
     noise : factor of all errors.  rate [Hz] : of samples.  seed : of the errors.
+
+    contact_force : [N] of a reading that counts as contact; noise never reaches it.
     """
 
     def __init__(self, robot: Robot, *, noise: float, rate: float, seed: int) -> None:
-        self.n, self.noise = robot.n, noise
+        self.n, self.noise, self.contact_force = robot.n, noise, CONTACT_DEVIATIONS * noise * HAND_FORCE
         self._random = np.random.default_rng(seed)
         # the accuracy in the data sheet is that of roll and pitch; yaw has no constant error here
         self._tilt = TILT * self._random.standard_normal(3) * [1.0, 1.0, 0.0]

@@ -115,7 +115,13 @@ class ControllerSettings(Described):
         metadata=about("distance of a sole's centre of pressure from its edges", unit="m", least=0, most=1),
     )
     least_force: float = field(
-        default=10.0, metadata=about("least normal force of each sole", unit="N", least=0, most=1e6)
+        default=10.0,
+        metadata=about(
+            "least normal force of each sole; of all together a quarter of the weight at most",
+            unit="N",
+            least=0,
+            most=1e6,
+        ),
     )
     iterations: int = field(
         default=30, metadata=about("iterations of OSQP in each QP", least=1, most=100_000)

@@ -201,7 +201,9 @@ class WrenchCones:
         self._weight, self._soles = weight, len(cones)
         self._matrix = block_diag(*cones) / weight if cones else np.zeros((0, 0))
         self._lower = np.zeros(self.m)  # least normal force, on the first constraint of each cone
-        self._lower[np.cumsum([0, *map(len, cones)])[:-1]] = settings.least_force / weight
+        # Soles that were to carry more than the robot weighs would leave all cones to the slack.
+        least = min(settings.least_force / weight, MAX_LEAST_LOAD / max(len(cones), 1))
+        self._lower[np.cumsum([0, *map(len, cones)])[:-1]] = least
         self._low = np.array([[*c.min(axis=0), 0.0] for c in corners])
         self._high = np.array([[*c.max(axis=0), 0.0] for c in corners])
         self._rotation = np.zeros((6 * len(cones), 6 * len(cones)))  # from world axes to those of the soles
@@ -239,9 +241,10 @@ class WrenchCones:
 
 PROJECTION_WINDOW = 0.01  # [s] before and after the impact in which velocity errors are projected
 FORCE_FILTER = 3e-3  # [s] time constant of the low-pass filter of the striking force
-CONTACT_FORCE = 20.0  # [N] that counts as contact: ten times the noise of the sensor
+MAX_LEAST_LOAD = 0.25  # of the weight, that all soles together carry at least
 MOMENT_ARM = 0.1  # [m] that makes the moments of a sole comparable with its forces
 RECOVERY_TORQUE_WEIGHT = 1e-3  # of torques over their limits; the recovery has no feed-forward to follow
+MIN_TORQUE_WEIGHT = 1e-6  # the tasks alone may leave torques free, and the Hessian has to be regular
 SWING_FOOT_BANDWIDTH = 40.0  # [rad/s]
 CLEARANCE_SCALE = 10.0  # [m/s^2] over which clearance constraints are of order one
 # Weights of the slacks: the linear one, large enough to leave cones only where they cannot be kept, and that
@@ -367,7 +370,7 @@ class WholeBodyController:
         self.striking_force += (1 - math.exp(-s.period / FORCE_FILTER)) * (
             measured.forces - self.striking_force
         )
-        self.tracking.update_contact(t, bool((measured.forces > CONTACT_FORCE).any()))
+        self.tracking.update_contact(t, bool((measured.forces > self.sensors.contact_force).any()))
         aim = self.tracking.at(t + delay)
         dynamics = self.stance_problem.dynamics
         dynamics.update(q, rates, self.striking_force, s.sole_bandwidth)
@@ -426,6 +429,7 @@ class WholeBodyController:
         P[:n, :n], g[:n] = tasks.quadratic_form()
         effort = s.blow if servo_torques else (RECOVERY_TORQUE_WEIGHT if recovers else s.torque)
         # flat stride n + 3 of the n + 2 columns is the diagonal
+        effort = max(effort, MIN_TORQUE_WEIGHT)
         P.flat[: n * (n + 2) : n + 3] += effort  # diagonal of the torques
         g[:n] -= effort * feed
         P.flat[n * (n + 3) :: n + 3], g[n:] = SLACK_SQUARE_WEIGHT, SLACK_WEIGHT  # diagonal of the slacks

@@ -20,9 +20,9 @@ from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
 Pair = tuple[int, int]
-# [m] Links no farther apart than this in the start posture count as touching. They are made to fit, as a joint
-# in its fork, and hulls are no more exact (`separation.THIN`). A share of so small a distance would be a
-# constraint that rounding decides: Fourier's N1 took 581 iterations with its shoulders', and takes 55 without.
+# [m] Links no farther apart than this in the start posture count as touching: they are made to fit, as a
+# joint in its fork, and hulls are no more exact (`separation.THIN`). Rounding would decide a constraint on a
+# share of so small a distance: Fourier's N1 took 581 iterations with its shoulders', and takes 55 without.
 FITTED = 1e-3
 
 

@@ -136,8 +136,12 @@ class TargetContact:
             hands = speeds + accelerations * t - inverse_mass @ y[h : 2 * h]
             return self.forces(y[:h], hands, y[2 * h + 1 :]), hands, self.speed(y[2 * h + 1 :])
 
+        # by instants of the integration's stages; the last at an instant that it keeps is of the state there
+        stages: dict[float, Array] = {}
+
         def rates(t: float, y: Array) -> list[float]:
             force, hands, target = forces(t, y)
+            stages[t] = force
             state_rates = self.target.derivative(y[2 * h + 1 :], float(force.sum()), self._target_parameters)
             return [*(hands - target), *force, target, *state_rates]
 
@@ -161,7 +165,7 @@ class TargetContact:
             )
         end, impulses = found.y[:, -1], found.y[h : 2 * h]
 
-        known = {t: forces(t, y)[0] for t, y in zip(found.t, found.y.T, strict=True)}
+        known = {t: stages[t] for t in found.t if t in stages}
 
         def found_forces(t: float) -> Array:
             if t not in known:

@@ -220,7 +220,6 @@ def test_rates_are_those_of_the_curve(arm: Solution, tmp_path: Path, which: str)
     np.testing.assert_allclose(found, rate[even], atol={"position": 1e-5, "velocity": 0.05}[which])
 
 
-@pytest.mark.slow
 def test_ros2_is_a_goal_that_replays_as_the_plan_does(arm: Solution, tmp_path: Path) -> None:
     _, path = arm.export("ros2", tmp_path / "goal")
     goal = yaml.safe_load(path.read_text(encoding="utf-8"))

@@ -88,7 +88,6 @@ def test_a_missed_blow_is_replayed_on_held_soles_too(saved: Path) -> None:
     assert report["torque_ratio"] < 1.05 and report["zmp_margin_m"] > 0
 
 
-@pytest.mark.slow
 def test_an_unsolved_plan_and_a_blow_that_does_not_hit_are_said(hammered: Solution, tmp_path: Path) -> None:
     record = record_of(hammered, problem=problem_file("arm_planar").read_text("utf-8"))
     save_record(record, tmp_path)

@@ -392,7 +392,6 @@ def test_contacts_that_are_too_weak_to_be_fitted_are_told() -> None:
 
 
 # ---------------------------------------------------------------- command
-@pytest.mark.slow
 def test_the_command_prints_numbers_and_writes_a_section(tmp_path: Path) -> None:
     log, path, out = log_of(TrueBlow("Hunt-Crossley"), seed=3), tmp_path / "blow.csv", tmp_path / "law.toml"
     columns = np.column_stack([log.time, log.force, log.speed])

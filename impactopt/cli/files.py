@@ -143,10 +143,7 @@ def new(
                 raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint=option)
         if reference and as_json:
             raise typer.BadParameter("the reference is Markdown; leave --json out", param_hint="--json")
-        from impactopt.errors import InputError
-
-        if out is not None and out.exists():  # before a draft, which takes a while
-            raise InputError(f"there is a file {out} already; give another --out, or delete it")
+        _check_free(out)  # before a draft, which takes a while
         if reference:
             from impactopt.files.problem_file.reference import reference as page
 
@@ -187,6 +184,14 @@ def _draft(
         typer.echo(printable(f"next: impactopt check {file}; then impactopt solve {file}"), err=True)
 
 
+def _check_free(out: Path | None) -> None:
+    """InputError if there is a file already."""
+    from impactopt.errors import InputError
+
+    if out is not None and out.exists():
+        raise InputError(f"there is a file {out} already; give another --out, or delete it")
+
+
 def _give(text: str, out: Path | None, as_json: bool = False) -> None:
     """Prints a file's text, or writes it to a new file; as JSON also its data."""
     from impactopt.codegen.files import write_atomically
@@ -194,6 +199,7 @@ def _give(text: str, out: Path | None, as_json: bool = False) -> None:
     from impactopt.files.toml import read_toml
 
     if out is not None:
+        _check_free(out)
         try:
             write_atomically(out, lambda file: file.write(text.encode()))
         except OSError as error:

@@ -59,9 +59,9 @@ def _file(name: str | os.PathLike[str], named: Mapping[str, Path], kind: str) ->
     try:
         path = Path(name)
     except TypeError:
+        text = "; `write_problem` gives the text of a problem's file" if kind == "problem" else ""
         raise InputError(
-            f"a {kind} is given by its name or its file, and this is of type {type(name).__name__}; "
-            "`write_problem` gives the text of a problem's file"
+            f"a {kind} is given by its name or its file, and this is of type {type(name).__name__}{text}"
         ) from None
     if path.suffix or len(path.parts) != 1 or is_plain_file(path):
         return path

@@ -188,19 +188,19 @@ def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any)
     """Simulation by an engine, with an estimate of its impulse's error by the steps.
 
     The step is at most that of `longest_stable_step`, and divides a controller's own period, as it is else
-    sampled at another rate. The impulse up to the end of the impact is compared with that of a
-    simulation with twice the step, or, if the given step is longer than the engine's default, with the
-    default. If the error is above 1 %, or the simulation diverges, the step is halved, at most three times; a
-    given step longer than the default is kept.
+    sampled at another rate; so do the steps of comparison. The impulse up to the end of the impact is
+    compared with that of a simulation with about twice the step, or, if the given step is longer than the
+    engine's default, with the default. If the error is above 1 %, or the simulation diverges, the step is
+    halved, at most three times; a given step longer than the default is kept.
     """
     # the default of the engine's signature
     own = float((run.__kwdefaults__ or {})["step"])
     controller, world = options.get("controller"), options.get("perturbation") or Perturbation()
     longest = longest_stable_step(*given, perturbation=world, controller=controller)
     step = min(float(options.pop("step", own)), longest)
-    if controller is not None and not world.period:
-        period = controller.period
-        longest, step = min(longest, period), period / math.ceil((1 - 1e-9) * period / step)
+    period = 0.0 if controller is None or world.period else controller.period
+    if period:
+        longest, step, own = min(longest, period), _divided(period, step), _divided(period, own)
     for left in range(HALVINGS, -1, -1):
         try:
             simulation = run(*given, **options, step=step)
@@ -209,12 +209,17 @@ def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any)
                 raise
             step /= 2
             continue
-        error = _step_error(run, given, options, simulation, step, own, longest)
+        error = _step_error(run, given, options, simulation, step, own, longest, period)
         simulation = replace(simulation, step_error=error)
         if not simulation.step_error > ALLOWED or step > own:
             break
         step /= 2
     return simulation
+
+
+def _divided(period: float, step: float) -> float:
+    """Longest step [s] that divides a period [s] and is no longer than `step`."""
+    return period / math.ceil((1 - 1e-9) * period / step)
 
 
 def _step_error(
@@ -225,16 +230,18 @@ def _step_error(
     step: float,
     own: float,
     stable: float,
+    period: float,
 ) -> float:
     """Difference of two simulations' impulses, relative to the larger; nan if both missed the target.
 
-    own, stable [s] : default step of the engine; `longest_stable_step`.
+    own, stable, period [s] : default step of the engine; `longest_stable_step`; a controller's own, else 0.
     """
     end = simulation.contact_end
     until = np.inf if np.isnan(end) else end + COMPARED_AFTER
     if simulation.missed or (until == np.inf and step <= own):
         return np.nan
-    others = own if step > own else 2 * step, step / 2
+    coarse = period / max(round(period / step) // 2, 1) if period else 2 * step
+    others = own if step > own else coarse, step / 2
     for other in others if step < stable else others[1:]:
         # an engine rounds the time at which it ends to steps; up to `last` there are both simulations
         longest = max(step, other)

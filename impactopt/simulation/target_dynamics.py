@@ -136,7 +136,7 @@ class TargetContact:
             hands = speeds + accelerations * t - inverse_mass @ y[h : 2 * h]
             return self.forces(y[:h], hands, y[2 * h + 1 :]), hands, self.speed(y[2 * h + 1 :])
 
-        # by instants of the integration's stages; the last at an instant that it keeps is of the state there
+        # by time; the last evaluation at the time of an accepted step is at its state
         stages: dict[float, Array] = {}
 
         def rates(t: float, y: Array) -> list[float]:

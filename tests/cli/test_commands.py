@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -412,6 +413,21 @@ def test_a_draft_is_quiet_if_asked_and_never_made_for_a_file_that_is_there(
     (tmp_path / "robot.toml").write_text("")
     error = run("new", "--urdf", urdf, "--out", tmp_path / "robot.toml", code=2)[1]
     assert "already; give another --out" in error and "trying strikes" not in error
+
+
+def test_a_file_that_comes_while_another_is_drafted_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "robot.toml"
+
+    def drafted(*_: Any, **__: Any) -> Any:
+        out.write_text("mine")
+        return SimpleNamespace(text="x = 1\n", said=[])
+
+    monkeypatch.setattr("impactopt.files.draft.drafting.draft_problem", drafted)
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text("<robot/>")
+    assert "already" in run("new", "--urdf", urdf, "--out", out, code=2)[1] and out.read_text() == "mine"
 
 
 def test_a_new_file_as_json_is_its_text_and_its_tables(tmp_path: Path) -> None:

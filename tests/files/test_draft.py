@@ -145,6 +145,15 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
             _drafted(tmp_path, text, motion=motion)
 
 
+def test_an_arm_in_millimetres_has_no_posture_and_is_told_why(tmp_path: Path) -> None:
+    def scaled(found: re.Match[str]) -> str:
+        return f'{found[1]}="{" ".join(str(1e3 * float(x)) for x in found[2].split())}"'
+
+    text = re.sub(r'((?<!axis )xyz|size)="([^"]*)"', scaled, urdfs.arm())
+    with pytest.raises(InputError, match=r"millimetres.*no posture is found"):
+        _drafted(tmp_path, text)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", ["punch", "nail"])
 def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path, motion: str) -> None:

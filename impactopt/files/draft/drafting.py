@@ -108,7 +108,18 @@ def draft_problem(
     say = report or (lambda text: None)
     say("reading the robot and the shapes of its links")
     drafted = draft_robot(path, mjcf=mjcf, bolted=bolted)
-    model, forward = drafted.robot.model, np.array(STRIKE_DIRECTIONS[0])
+    try:
+        return _of_motion(drafted, motion, folder, say, planned=planned)
+    except InputError as error:
+        # the reason, where a robot of that size or with such limits has no posture
+        raise InputError("; ".join([*unit_doubts(drafted.robot), str(error)])) from error
+
+
+def _of_motion(
+    drafted: Drafted, motion: str | None, folder: Path, say: Callable[[str], None], *, planned: bool
+) -> Draft:
+    """Draft of the motion, or, if that is None, of the first one that the robot can do."""
+    path, model, forward = drafted.path, drafted.robot.model, np.array(STRIKE_DIRECTIONS[0])
     soles: list[Sole] = []
     if drafted.legs:
         soles, forward = find_soles(model, drafted.legs, drafted.pieces)

@@ -196,10 +196,10 @@ def _check_bolted(first: Description, found: Drafted, ties: Sequence[Tie]) -> No
     """
     what, fix = "the root link has no mass", "give it an <inertial>, or bolt it to the ground (--bolted)"
     free = [
-        str(name) for name, joint in zip(first.model.names, first.model.joints, strict=True) if joint.nv > 1
+        str(name) for name, joint in zip(first.model.names, first.model.joints, strict=True) if joint.nv == 6
     ]
     if len(free) > 1:
-        what, fix = f"joint {free[1]!r} is floating", "take it and the link before it out"
+        what, fix = f"joint {free[1]!r} is floating", "remove it and its parent link"
     if ties:
         what, fix = ties[0].text, f"{ties[0].fix}, or bolt it to the ground (--bolted)"
     model = lock_joints(first.model, found.options["locked"])

@@ -11,10 +11,10 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class SelfCollision(Term):
-    """Links of the robot have clearance, except those that a joint connects or that touch at the start.
+    """Links of the robot have clearance, except those that a joint connects or within 1 mm at the start.
 
-    It is required from start to rest, after a miss too. Two links that are nearer than the margin at the
-    start may stay so near.
+    It is required from start to rest, after a miss too. Other links that are nearer than the margin at
+    the start may stay so near.
     """
 
     name: ClassVar[str] = "self-collision"

@@ -241,7 +241,7 @@ class WrenchCones:
 
 PROJECTION_WINDOW = 0.01  # [s] before and after the impact in which velocity errors are projected
 FORCE_FILTER = 3e-3  # [s] time constant of the low-pass filter of the striking force
-MAX_LEAST_LOAD = 0.25  # of the weight, that all soles together carry at least
+MAX_LEAST_LOAD = 0.25  # largest sum of the soles' least forces, over the weight
 MOMENT_ARM = 0.1  # [m] that makes the moments of a sole comparable with its forces
 RECOVERY_TORQUE_WEIGHT = 1e-3  # of torques over their limits; the recovery has no feed-forward to follow
 MIN_TORQUE_WEIGHT = 1e-6  # the tasks alone may leave torques free, and the Hessian has to be regular
@@ -428,8 +428,8 @@ class WholeBodyController:
         P, g = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
         P[:n, :n], g[:n] = tasks.quadratic_form()
         effort = s.blow if servo_torques else (RECOVERY_TORQUE_WEIGHT if recovers else s.torque)
-        # flat stride n + 3 of the n + 2 columns is the diagonal
         effort = max(effort, MIN_TORQUE_WEIGHT)
+        # flat stride n + 3 of the n + 2 columns is the diagonal
         P.flat[: n * (n + 2) : n + 3] += effort  # diagonal of the torques
         g[:n] -= effort * feed
         P.flat[n * (n + 3) :: n + 3], g[n:] = SLACK_SQUARE_WEIGHT, SLACK_WEIGHT  # diagonal of the slacks

@@ -958,7 +958,7 @@ def test_the_root_of_an_arm_needs_no_mass(tmp_path: Path, base: str) -> None:
 def test_a_walker_with_a_floating_joint_of_its_own_is_refused_for_that(tmp_path: Path) -> None:
     free = '<joint name="free" type="floating"><parent link="world"/><child link="trunk"/></joint>'
     text = urdfs.biped().replace("</robot>", f'<link name="world"/>{free}</robot>')
-    with pytest.raises(InputError, match=r"'free' is floating, and .*; take it and the link before it out$"):
+    with pytest.raises(InputError, match=r"'free' is floating, and .*; remove it and its parent link$"):
         _robot(tmp_path, text)
 
 

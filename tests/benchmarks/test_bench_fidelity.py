@@ -171,6 +171,7 @@ def test_freezing_again_makes_it_better_and_a_point_mass_is_far_off(short: Repor
     assert all(row["failed"] == 0 and row["pushes"] == [] for row in rows.values())
 
 
+@pytest.mark.slow
 def test_mujoco_agrees_with_the_reference(short: Report) -> None:
     assert short.numbers["mujoco_collisions"] == 1
     assert short.numbers["mujoco_vs_pinocchio_pct"] < 0.01

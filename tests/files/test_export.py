@@ -301,6 +301,7 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
         arm.export("csv", tmp_path / "none", smooth=(0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_a_smoothed_motion_that_presses_on_is_told(arm: Solution, tmp_path: Path) -> None:
     """Low accelerations brake behind the target's surface: what the arm presses there is no impact."""
     meta, path = arm.export("csv", tmp_path / "csv", smooth=(15.0, 2000.0))
@@ -327,6 +328,7 @@ def test_feed_forward_beyond_the_torque_limit_is_told(planned: Planned, tmp_path
     assert told == pytest.approx((np.abs(torque) / robot.torque_limit).max(), rel=0.02) and told > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [200.0, 50.0])
 def test_a_smoothed_motion_ends_at_rest_at_any_rate(arm: Solution, tmp_path: Path, rate: float) -> None:
     """At the first sample at or after its end, which is 0.1 s after the plan's."""

@@ -210,6 +210,7 @@ def test_of_a_striking_link_with_corners() -> None:
     check_rows(t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["strike_holding_on", "push_two_hands"])
 def test_of_two_hands(name: str) -> None:
     problem = load_problem(PROBLEMS / f"{name}.toml")
@@ -327,6 +328,7 @@ def test_of_soles_that_change(blow: int, count: int) -> None:
     check_rows(t.with_clearance(rows))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moves", [False, True])
 @pytest.mark.parametrize("stiffness", [0.0, 8e3])
 @pytest.mark.parametrize("robot", ["arm", "biped"])

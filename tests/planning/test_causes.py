@@ -93,6 +93,7 @@ def test_no_cause_is_confirmed_by_a_motion_through_an_obstacle(arm: ImpactProble
     assert not searched(blocked)[2].causes
 
 
+@pytest.mark.slow
 def test_clearances_that_are_too_many_together_are_named(arm: ImpactProblem) -> None:
     """A shelf of several boxes at the hit point: without one of them alone there is no motion."""
     low = [dataclasses.replace(phase, intervals=6) for phase in (arm.swing, arm.follow)]

@@ -129,6 +129,7 @@ def test_no_other_stiffness_is_better(chosen: Solution) -> None:
     assert lost[1] < 0.5 * lost[0] and lost[2] < 0.5 * lost[3]
 
 
+@pytest.mark.slow
 def test_it_brings_more_than_the_stiffness_that_is_given(chosen: Solution) -> None:
     assert _worth(chosen) > 1.02 * _worth(solve(_soft()))
 

@@ -85,12 +85,14 @@ def test_the_collision_is_that_of_full_dynamics(solution: Solution) -> None:
     assert solution.impulse == pytest.approx(full.impulse, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_what_is_before_the_last_six_joints_moves() -> None:
     s = solved("seven and a waist")
     free = [k for k, name in enumerate(s.problem.robot.joint_names) if "waist" in name or "tilt" in name]
     assert len(free) == 4 and (np.ptp(s.trajectory.q[:, 7:][:, free], axis=0) > 0.05).all()
 
 
+@pytest.mark.slow
 def test_hinges_bear_no_torque_and_keep_to_their_range() -> None:
     s = solved("five")
     r, ref = s.problem.robot, s.trajectory

@@ -347,6 +347,7 @@ def test_the_stance_of_a_problem_is_that_of_the_blow() -> None:
     assert biped_problem(biped()).hash == dataclasses.replace(biped_problem(biped()), stances=()).hash
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [False, True], ids=["ends", "begins"])
 def test_a_foot_that_is_lifted_for_the_blow_at_the_end_or_the_start_stays_off_the_ground(first: bool) -> None:
     """In a sequence of one phase, the follow-through or the swing, too."""

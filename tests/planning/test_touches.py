@@ -76,6 +76,7 @@ def test_it_is_solved_with_the_touches_that_point_masses_need(chopped: Solution)
     assert "caution" not in chopped.summary()
 
 
+@pytest.mark.slow
 def test_it_is_replayed_as_planned(chopped: Solution) -> None:
     replay = chopped.validate()
     assert replay.impulse == pytest.approx(chopped.impulse, rel=2e-3)
@@ -236,6 +237,7 @@ def test_its_touches_are_those_of_replays(rattled: Solution, engine: str) -> Non
     np.testing.assert_allclose(begins, found[1:, 0], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_work_on_its_head_is_that_of_the_wood(rattled: Solution) -> None:
     """R z + hardening z^2 / 2, with what the nail coasts in the gaps; impulse and momentum agree there."""
     wood, hit = rattled.problem.target, rattled.plan.collision

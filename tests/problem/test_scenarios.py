@@ -91,6 +91,7 @@ def test_it_solves_and_each_target_that_is_hit_is_foreseen(solved: Planned) -> N
     assert [s.name for s in solved.plan.scenarios] == wanted
 
 
+@pytest.mark.slow
 def test_a_scenario_that_is_as_expected_is_the_expected_collision(solved: Planned) -> None:
     plan, same = solved.plan, foreseen(solved, EXPECTED.name)
     assert same.impulse == pytest.approx(plan.impulse, rel=1e-6)

@@ -95,6 +95,7 @@ def lethal(folder: Path, unit: Unit) -> Any:
     return Found(columns={"reason": ["", ""]}, peak_mb=0.0)
 
 
+@pytest.mark.slow
 def test_workers_of_another_version_are_refused(client: Any) -> None:
     work = Work(data={}, path=Path("p"), settings=SweepSection(problem="p"), version="0.0.0")
     with pytest.raises(InputError, match=r"a worker has impactopt .*, the sweep 0\.0\.0"):

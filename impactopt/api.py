@@ -128,6 +128,23 @@ class Solution(solution.Solution):
 
         return plot(self, what, ax=ax, simulation=simulation, replay=replay)
 
+    def save(self, directory: str | PathLike[str]) -> Path:
+        """Writes `solution.npz` and `summary.json`, as `impactopt solve --out` does; returns their directory.
+
+        `load_solution` and all commands read them. A failed solution does not replace a good one: it goes
+        into the subdirectory `failed`.
+
+        Raises
+        ------
+        InputError : they cannot be written; a problem that no file can have (`write_problem`), as one with
+            classes of your own. Pickle keeps such a solution.
+        """
+        from impactopt.files.output import keep_record, make_directory, record_of
+        from impactopt.files.problem_file import write_problem
+
+        text = write_problem(self.problem, folder=directory)
+        return keep_record(record_of(self, problem=text), make_directory(directory))[0].parent
+
     def to_frame(self, *, missed: bool = False) -> Any:
         """Planned motion as a pandas table, by time [s]: ``solution.to_frame()["q leg_left_4_joint"]``.
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.native_cases import HARDENING
 from typer.testing import CliRunner
 
-from impactopt import InputError, Solution, load_solution, sensitivity_of
+from impactopt import FreeMass, Impulse, InputError, Solution, Status, load_solution, sensitivity_of
 from impactopt.cli.app import app
 from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.record import NUMBERS
@@ -148,3 +150,21 @@ def test_a_saved_result_is_a_solution_again(folder: SolvedFolder, solution: Solu
     assert again.sensitivity(price).impulse == pytest.approx(expected, rel=1e-6)
     with pytest.raises(InputError, match=r"there is no .*solution\.npz"):
         load_solution(tmp_path / "nothing")
+
+
+def test_a_solution_is_saved_from_python(hammered: Solution, tmp_path: Path) -> None:
+    folder = hammered.save(tmp_path / "nail")
+    assert folder == tmp_path / "nail" and load_solution(folder).problem.hash == hammered.problem.hash
+    assert load_solution(folder).trajectory.q == pytest.approx(hammered.trajectory.q, abs=1e-9)
+    shown = CliRunner().invoke(app, ["verify", str(folder), "--quiet"])
+    assert shown.exit_code == 0, shown.output
+    result = dataclasses.replace(hammered.result, status=Status.FAILED)
+    failed = dataclasses.replace(hammered, result=result)
+    assert failed.save(folder) == folder / "failed"
+    mass = dataclasses.replace(
+        hammered.problem, target=FreeMass(mass=1.0), law=HARDENING, objectives=(Impulse(),)
+    )
+    own = dataclasses.replace(hammered, problem=mass)
+    with pytest.raises(InputError, match="CustomLaw"):
+        own.save(tmp_path / "own")
+    assert not (tmp_path / "own").exists()

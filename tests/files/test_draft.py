@@ -154,6 +154,13 @@ def test_an_arm_in_millimetres_has_no_posture_and_is_told_why(tmp_path: Path) ->
         _drafted(tmp_path, text)
 
 
+def test_knees_without_a_range_are_named_where_no_posture_is_found(tmp_path: Path) -> None:
+    knee = r'(<joint name="[^"]*knee".*?)lower="[^"]*" upper="[^"]*"'
+    text = re.sub(knee, r'\1lower="0" upper="0"', urdfs.biped(), flags=re.DOTALL)
+    with pytest.raises(InputError, match=r"without a range, locked: left_knee, right_knee; no posture"):
+        _drafted(tmp_path, text)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", ["punch", "nail"])
 def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path, motion: str) -> None:

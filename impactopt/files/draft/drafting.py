@@ -21,7 +21,7 @@ from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.errors import InputError, counted
 from impactopt.files.draft.default_drives import DOUBT
 from impactopt.files.draft.hits import Hit, hits
-from impactopt.files.draft.limbs import Limb, renumbered
+from impactopt.files.draft.limbs import NO_RANGE, Limb, renumbered
 from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
@@ -112,7 +112,10 @@ def draft_problem(
         return _of_motion(drafted, motion, folder, say, planned=planned)
     except InputError as error:
         # the reason, where a robot of that size or with such limits has no posture
-        raise InputError("; ".join([*unit_doubts(drafted.robot), str(error)])) from error
+        causes = [*unit_doubts(drafted.robot)]
+        if still := sorted(joint for joint, why in drafted.locked.items() if why == NO_RANGE):
+            causes.append(f"joints without a range, locked: {', '.join(still)}")
+        raise InputError("; ".join([*causes, str(error)])) from error
 
 
 def _of_motion(

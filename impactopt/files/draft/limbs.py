@@ -29,6 +29,7 @@ FOOT_HEIGHT, ROOT_HEIGHT = 0.05, 0.1
 # ranges [m] of a prismatic, and [rad] of a revolute joint: larger ones drive a mobile base, the latter if it
 # is on the former
 TRAVEL, TURN = 20.0, 4 * np.pi
+NO_RANGE = "no range"  # reason for which a joint is locked
 TOE = 0.03  # [m] from an ankle to a toe's joint, at least; half of it: largest height of foot over toe
 
 
@@ -84,7 +85,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
         if low > high:
             continue  # crossed limits are a mistake of the file, which the robot's checks report
         if not low < high:
-            out[name] = "no range"
+            out[name] = NO_RANGE
         elif _WHEELS.search(name) or (joint.nq == 2 and model.parents[j] < first and not children[j]):
             out[name] = "a wheel"
         elif _FINGERS.search(name):

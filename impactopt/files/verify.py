@@ -117,8 +117,9 @@ def verify_record(record: Record, problem: ImpactProblem, *, other_summary: bool
         made = program_of_record(record, problem)
         same = made is not None and _same_program(made, record)
     except (ValueError, KeyError, TypeError, IndexError) as error:
+        what = f"it has no {error}" if isinstance(error, KeyError) else repr(error)
         fix = "solve again with `impactopt solve`"
-        raise InputError(f"this result's description of its program is damaged ({error!r}); {fix}") from error
+        raise InputError(f"this result's description of its program is damaged ({what}); {fix}") from error
     if made is None or not same:
         found.reasons.append("its program is not the one that its problem has today: solve again")
         return found.verdict(None, None)

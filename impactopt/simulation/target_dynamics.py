@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -136,12 +137,8 @@ class TargetContact:
             hands = speeds + accelerations * t - inverse_mass @ y[h : 2 * h]
             return self.forces(y[:h], hands, y[2 * h + 1 :]), hands, self.speed(y[2 * h + 1 :])
 
-        # by time; the last evaluation at the time of an accepted step is at its state
-        stages: dict[float, Array] = {}
-
         def rates(t: float, y: Array) -> list[float]:
             force, hands, target = forces(t, y)
-            stages[t] = force
             state_rates = self.target.derivative(y[2 * h + 1 :], float(force.sum()), self._target_parameters)
             return [*(hands - target), *force, target, *state_rates]
 
@@ -165,12 +162,9 @@ class TargetContact:
             )
         end, impulses = found.y[:, -1], found.y[h : 2 * h]
 
-        known = {t: stages[t] for t in found.t if t in stages}
-
+        @cache
         def found_forces(t: float) -> Array:
-            if t not in known:
-                known[t] = forces(t, found.sol(t))[0]
-            return known[t]
+            return forces(t, found.sol(t))[0]
 
         times = _with_both_sides(found.t, lambda t: bool(found_forces(t).any()))
         values = np.array([found_forces(t) for t in times])

@@ -134,12 +134,9 @@ class ContactLaw(Described, ABC):
 
         Arguments are floats, arrays or CasADi expressions.
         """
-        compressing = rate > 0
-        if isinstance(compressing, (bool, np.bool_)):  # replays call this a million times
-            force = self.branch(penetration, rate, bool(compressing), parameters)
-        else:
-            both = (self.branch(penetration, rate, phase, parameters) for phase in (True, False))
-            force = choose(compressing, *both)
+        compression = self.branch(penetration, rate, True, parameters)
+        restitution = self.branch(penetration, rate, False, parameters)
+        force = choose(rate > 0, compression, restitution)
         none = 0.0 * force
         return choose(penetration >= 0, choose(force > 0, force, none), none)
 

@@ -300,7 +300,15 @@ def test_joints_that_are_locked_keep_their_places() -> None:
 
 
 @compiled
-def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(setup: Setup) -> None:
+def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(
+    setup: Setup, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def timed(runs: dict[str, Any], **options: Any) -> dict[str, float]:
+        """A collision takes twice the time of freezing: a busy machine may make a difference negative."""
+        found = clock.shortest(runs, **options)
+        return found | {name: 2 * found[f"{name} frozen"] for name in runs if f"{name} frozen" in runs}
+
+    monkeypatch.setattr(scaling, "shortest", timed)
     numbers = scaling.run(
         quiet,
         chains=(2, 4),
@@ -319,8 +327,7 @@ def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(setup: Setup) -
     assert [(r["robot"], r["n"]) for r in dof] == [("chain", 2), ("chain", 4), ("tree", 8)]
     for r in dof:
         assert r["freeze_us"] > 0 and r["time_us"] > 0  # which is longer, a busy machine may turn round
-    # differences of times, which a busy machine may make negative
-    assert dof[0]["stage_us"] is None is not dof[2]["stage_us"] and dof[2]["loop_us"] is not None
+    assert dof[0]["stage_us"] is None and dof[2]["stage_us"] > 0 and dof[2]["loop_us"] > 0
     assert dof[1]["paper_once"] > dof[0]["paper_once"]
     errors = {(r["method"], r["tolerance"]): r["integration_error"] for r in rows if r["over"] == "step"}
     assert errors["rk4", None] < 1e-3

@@ -113,8 +113,10 @@ def draft_problem(
     except InputError as error:
         # the reason, where a robot of that size or with such limits has no posture
         causes = [*unit_doubts(drafted.robot)]
-        if still := sorted(joint for joint, why in drafted.locked.items() if why == NO_RANGE):
-            causes.append(f"joints without a range, locked: {', '.join(still)}")
+        if fixed := sorted(joint for joint, why in drafted.locked.items() if why == NO_RANGE):
+            causes.append(f"joints without a range, locked: {', '.join(fixed)}")
+        if not causes:
+            raise
         raise InputError("; ".join([*causes, str(error)])) from error
 
 

@@ -21,7 +21,7 @@ from impactopt.robots.robot import Robot
 Array = NDArray[np.float64]
 Pair = tuple[int, int]
 # [m] Links no farther apart than this in the start posture count as touching: they are made to fit, as a
-# joint in its fork, and hulls are no more exact (`separation.THIN`). Rounding would decide a constraint on a
+# joint in its fork, and constraints know shapes no better (`separation.THIN`). Rounding would decide one on a
 # share of so small a distance: Fourier's N1 took 581 iterations with its shoulders', and takes 55 without.
 FITTED = 1e-3
 

@@ -253,22 +253,6 @@ def test_two_alike_are_one_on_half_the_target() -> None:
     assert at == pytest.approx([0.005, 0.015])
 
 
-def test_no_force_of_a_step_is_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a step within which a touch begins; what repeats are the states that the integration begins with."""
-    contact, found = scene(1.0, second=False), list[bytes]()
-    forces = contact.forces
-
-    def counted(depths: Array, speeds: Array, state: Array) -> Array:
-        found.append(b"".join(x.tobytes() for x in (depths, speeds, state)))
-        return forces(depths, speeds, state)
-
-    monkeypatch.setattr(contact, "forces", counted)
-    one = contact.pushed(
-        np.array([-1e-3]), np.array([1.5]), np.zeros(1), np.array([[0.4]]), np.zeros(1), 0.0, 2e-3
-    )
-    assert one.total.any() and len(found) - len(set(found)) <= 2 < len(one.times)
-
-
 def test_a_file_has_the_second_striker(problem: ImpactProblem) -> None:
     again = parse_problem_file(write_problem(problem), Path("problem.toml")).build()
     assert again.hash == problem.hash and again.strikers == ("right_hand", "left_hand")

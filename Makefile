@@ -102,7 +102,8 @@ docs: $(STAMP) ## build the documentation, needs no internet: build/docs/index.h
 notebooks: $(STAMP) ## execute the notebooks, some minutes; with their outputs in results/notebooks (ARGS=notebooks/3_*.ipynb for one)
 	@mkdir -p results/notebooks
 	@echo "== executing notebooks, two at a time"
-	@printf '%s\n' $(or $(ARGS),notebooks/*.ipynb) | xargs -P 2 -I FILE sh -c ' \
+	@# The last notebooks take longest, so they come first.
+	@printf '%s\n' $(or $(ARGS),notebooks/*.ipynb) | sort -rV | xargs -P 2 -I FILE sh -c ' \
 		log=results/notebooks/$$(basename FILE .ipynb).log; \
 		if $(BIN)/jupyter execute --timeout=600 --output=../results/notebooks/{notebook_name} FILE >$$log 2>&1; \
 		then echo "== FILE"; \

@@ -130,6 +130,7 @@ def test_compiled_code_is_its_graph_with_friction_too(kind: Any, options: Any) -
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_frozen_models_have_derivatives_with_friction() -> None:
     model, (q, v, torque) = oblique(contact_friction=GENTLE)
     value, _, by_v = model.gradient_function("impulse")(q, v, torque)

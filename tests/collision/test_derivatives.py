@@ -52,7 +52,9 @@ def flat(function: Any, values: list[Any]) -> list[Any]:
     return [np.array(x).ravel(order="F") for x in function.call([ca.DM(x) for x in values])]
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow) if "biped" in case else case for case in CASES]
+)
 def test_the_jacobian_is_that_of_differences_by_every_input(case: str) -> None:
     """Of collisions with steps that leave out 1e-13, extrapolated: within 1e-6 of the largest derivative
     along the way, or of the output where that is larger."""
@@ -87,6 +89,7 @@ def test_the_jacobian_is_that_of_differences_by_every_input(case: str) -> None:
             assert np.abs(along - expected).max() <= 1e-6 * scale, (output, name)
 
 
+@pytest.mark.slow
 def test_the_length_of_a_quaternion_does_not_count() -> None:
     model, values, outputs = model_of("a biped")
     function = model.function(outputs, by=("q", "v"))

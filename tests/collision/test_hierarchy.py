@@ -122,6 +122,7 @@ def test_virtual_mass_says_what_it_does_not_know():
 
 # ------------------------------------------------------------ several freezes
 @pytest.mark.parametrize("seed, speed", [(0, 1.0), (3, 2.0)])
+@pytest.mark.slow
 def test_freezes_converge_to_full_dynamics_with_their_square(seed, speed):
     robot = robot_named("talos")
     q, v, torque = situation(robot, seed=seed, speed=speed)
@@ -235,6 +236,7 @@ def test_matrices_of_gains_are_those_of_the_joints_if_diagonal_and_couple_joints
 
 
 # ------------------------------------------------------------ a hand that supports
+@pytest.mark.slow
 def test_a_held_hand_stays_and_bears_what_the_ground_does_not():
     robot = inside_the_hand()
     stance = BothSoles(hands=("left_hand",))

@@ -124,6 +124,7 @@ def cases_of(model: SDC, count: int) -> list[tuple[Any, Any, Any, dict[str, Any]
 
 @pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("name", MODELS)
+@pytest.mark.slow
 def test_random_collisions_are_the_exact_ones(name: str) -> None:
     """The impulse to ten times the tolerance, whatever the events on the way; and better with a better one.
 

@@ -97,7 +97,9 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow) if "biped" in case else case for case in CASES]
+)
 def test_each_column_is_that_of_differences(case):
     name, options = CASES[case]
     model = implicit(name, **{**SHORT, **options})
@@ -120,6 +122,7 @@ def test_joints_that_saturate_and_slide_on_the_way():
     assert_slopes(stepped(model, outputs, values), found, model, values, np.eye(8))
 
 
+@pytest.mark.slow
 def test_a_stand_in_in_random_directions():
     model = implicit("standin", stance=BothSoles(hands=("left_hand",)), **SHORT)
     values, outputs = situation("standin", model), ("zmp", "torque", "hand_wrench", "separated")

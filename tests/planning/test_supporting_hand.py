@@ -73,6 +73,7 @@ def test_the_hand_stays_where_it_is(solution: Solution) -> None:
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_the_grip_bears_what_it_may_and_no_more(solution: Solution) -> None:
     """At nodes and in contact; it is used to its limit."""
     plan, grip = solution.plan, grip_of(solution.problem)
@@ -84,6 +85,7 @@ def test_the_grip_bears_what_it_may_and_no_more(solution: Solution) -> None:
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_motion_and_wrenches_balance_at_the_nodes(solution: Solution) -> None:
     """Inverse dynamics of the whole robot against J' w of soles and hand, by Pinocchio alone."""
     p, plan = solution.problem, solution.plan

@@ -81,6 +81,7 @@ def test_a_moved_point_leaves_the_other_hand_at_its_own(problem: ImpactProblem) 
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_the_target_has_the_momentum_of_both_forces(solution: Solution) -> None:
     """By the trapezoidal rule on elements half as long: within what that leaves."""
     hit = solution.contact_error.finer[0] if solution.contact_error else solution.plan.collision
@@ -159,6 +160,7 @@ def blow(solution: Solution, step: float) -> tuple[Array, float]:
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_the_collision_is_that_of_full_dynamics(solution: Solution) -> None:
     impulses, duration = blow(solution, 2e-4)
     assert impulses.sum() == pytest.approx(solution.impulse, rel=0.01)

@@ -258,6 +258,7 @@ def with_stance(sections: dict[str, Any], ahead: float = 0.4) -> ProblemFile:
     return problem_file_from_data(data, where="standin.toml")
 
 
+@pytest.mark.slow
 def test_a_robot_stands_as_in_the_phase_of_the_impact() -> None:
     outputs, given = ("impulse_Ns", "zmp_margin_m", "sole_force_N"), {"speed_m_s": 0.5}
     long = {"duration_s": 0.6}

@@ -133,7 +133,7 @@ class Bodies:
         self.start, self.standing = start, standing
         self.links: RobotBodies = bodies_of(robot)
         left_out = {frozenset(pair) for pair in robot.disable_collisions}
-        self.pairs, self.touching = self.links.piece_pairs(start, left_out)
+        self.pairs, _ = self.links.piece_pairs(start, left_out)
         at = Places.of(robot, start[None], np.zeros(1), np.zeros(1, dtype=np.intp))
         self.world_pairs: list[Pair] = []
         for w, body in enumerate(world):
@@ -152,10 +152,8 @@ class Bodies:
                         "from another posture, or move the body or make it smaller"
                     )
                 # A lifted foot or a knee on the ground at the start: a constraint would be violated at once.
-                if body.ground and self.exact(at, 0, (j, -1 - w)) <= 0:
-                    self.touching.append((self.links.name(j), body.name))
-                    continue
-                self.world_pairs.append((j, w))
+                if not (body.ground and self.exact(at, 0, (j, -1 - w)) <= 0):
+                    self.world_pairs.append((j, w))
 
     def with_target_moved(self, displacement: Array) -> Bodies:
         """Copy with the target and its supports displaced by (3,) [m]; the pairs are the same."""

@@ -28,6 +28,7 @@ _REQUEST = coal.DistanceRequest()
 # [m], [s] Two bodies that penetrate by more than the first are evaluated once in the second.
 _SHALLOW, _DEEP_INTERVAL = 2e-3, 5e-3
 _CLOSE = 2e-2  # [m] clearance up to which a survey is tried first
+SINKING = 3e-3  # [m] by which a link without load that is on the ground at the start may sink into it
 DEEPEST = -1e-6  # [m] distance below which bodies penetrate
 SLACK = 2 * THIN  # [m] by which bodies may be nearer than the smooth distances of their thinned hulls
 SURVEYED = 0.1  # [m] larger clearances are not measured in surveys of a motion
@@ -151,9 +152,13 @@ class Bodies:
                         f"at the start the link {self.links.name(j)!r} is in the body {body.name!r}: start "
                         "from another posture, or move the body or make it smaller"
                     )
-                # A lifted foot or a knee on the ground at the start: a constraint would be violated at once.
-                if not (body.ground and self.exact(at, 0, (j, -1 - w)) <= 0):
+                depth = -self.exact(at, 0, (j, -1 - w)) if body.ground else -np.inf
+                if depth < 0:
                     self.world_pairs.append((j, w))
+                else:  # a foot without load, or a toe: a constraint would be violated at once
+                    lower = body.place - (depth + SINKING) * np.array([0.0, 0.0, 1.0])
+                    self.world_pairs.append((j, len(self.world)))
+                    self.world += (replace(body, place=lower),)
 
     def with_target_moved(self, displacement: Array) -> Bodies:
         """Copy with the target and its supports displaced by (3,) [m]; the pairs are the same."""

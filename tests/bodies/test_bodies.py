@@ -440,6 +440,30 @@ def test_a_nail_stands_out_of_its_block() -> None:
     np.testing.assert_allclose(spans(deep["target's block"][0])[0, 0], 0.005, atol=1e-12)
 
 
+def test_a_foot_without_load_that_is_on_the_ground_at_the_start_sinks_no_deeper() -> None:
+    """It was exempt from the ground: a plan kept it 5 mm below, and the robot fell in MuJoCo."""
+    problem = load_problem("punch_one_foot")
+    robot = problem.robot
+    model, data = robot.model, robot.model.createData()
+    leg = [7 + robot.joint_names.index(f"right_{name}") for name in ("hip_pitch", "knee", "ankle_pitch")]
+
+    def lowered(bend: float) -> tuple[Array, float]:
+        q = np.array(robot.posture("on_left_foot"))
+        q[leg] = -bend, 2 * bend, -bend  # the foot stays level
+        pin.framesForwardKinematics(model, data, q)
+        return q, float(data.oMf[model.getFrameId("right_sole")].translation[2])
+
+    def foot_at(height: float) -> Array:
+        return lowered(brentq(lambda bend: lowered(bend)[1] - height, 0.1, 1.0))[0]
+
+    bodies = dataclasses.replace(problem, start=foot_at(-0.001)).bodies
+    for height, depth in ((-0.001, None), (-0.003, None), (-0.009, 0.005)):
+        places = Places.of(robot, foot_at(height)[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+        touches = bodies.survey(np.zeros(1), places).touches
+        assert [(t.one, t.other) for t in touches] == ([("right_ankle_roll", "ground")] if depth else [])
+        assert [t.depth for t in touches] == pytest.approx([depth] if depth else [], abs=1e-5)
+
+
 def test_the_ground_is_what_is_below() -> None:
     floor = ground_body(0.0)
     assert distance(coal.Sphere(0.1), at(np.array([1.0, 2.0, 0.3])), floor.shape, at(floor.place)) == (

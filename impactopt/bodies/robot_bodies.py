@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from impactopt.bodies.convex_hulls import Piece, file_pieces, is_too_large, pieces_of
-from impactopt.robots.build import parent_body
+from impactopt.robots.build import neutral, parent_body
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -24,6 +24,8 @@ Pair = tuple[int, int]
 # joint in its fork, and constraints know shapes no better (`separation.THIN`). Rounding would decide one on a
 # share of so small a distance: Fourier's N1 took 581 iterations with its shoulders', and takes 55 without.
 FITTED = 1e-3
+# Links with fewer joints between them are always near.
+NEIGHBOUR_JOINTS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,6 +111,25 @@ class RobotBodies:
                 if kept:
                     out[a, b] = tuple(kept)
         return out, touching
+
+    def overlaps(self, q: Array, disabled: Iterable[frozenset[str]] = ()) -> set[frozenset[str]]:
+        """Pairs of links, no neighbours, that touch at ``q`` (nq,), but not with all joints at or near zero.
+
+        Hulls that are too large for their links touch in both.
+        """
+        robot, rest = self.robot, neutral(self.robot.model)
+        angles, step = robot.joint_positions(rest), np.zeros(robot.nv)
+        step[robot.nv - robot.n :] = np.clip(angles, robot.lower, robot.upper) - angles
+        joint = {piece.link: piece.joint for piece in self.pieces}
+        supports = [set(joints) for joints in robot.model.supports]
+
+        def distant(posture: Array) -> set[frozenset[str]]:
+            _, touching = self.piece_pairs(posture, disabled)
+            between = ((pair, supports[joint[pair[0]]] ^ supports[joint[pair[1]]]) for pair in touching)
+            return {frozenset(pair) for pair, joints in between if len(joints) >= NEIGHBOUR_JOINTS}
+
+        found = distant(q)
+        return found - distant(np.asarray(pin.integrate(robot.model, rest, step))) if found else found
 
 
 _KNOWN: weakref.WeakKeyDictionary[Robot, RobotBodies] = weakref.WeakKeyDictionary()

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import DEEPEST, MISSED, SLACK, Bodies, Places
-from impactopt.bodies.robot_bodies import Pair
+from impactopt.bodies.robot_bodies import NEIGHBOUR_JOINTS, Pair
 from impactopt.bodies.separation import ROUNDING, Looked, Placed
 from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.refinement import Evaluation, Guess, Outcome, Program
@@ -43,7 +43,7 @@ IN_CONTACT, AFTER_CONTACT = 1, 2  # phases, as of `Places.phase`
 # than INCLUDE get constraints.
 INCLUDE, TRIGGER = 0.1, 0.03
 # Links with fewer than NEIGHBOUR_JOINTS joints between them are always near and can hardly meet.
-NEIGHBOUR_JOINTS, INCLUDE_NEIGHBOURS, TRIGGER_NEIGHBOURS = 4, 0.03, 0.015
+INCLUDE_NEIGHBOURS, TRIGGER_NEIGHBOURS = 0.03, 0.015
 # A required clearance is at most this part of the distance at the start, which so is allowed.
 START_FRACTION = 0.25
 START_PENETRATION_SLACK = 2e-3  # [m] further penetration allowed to pairs that penetrate at the start

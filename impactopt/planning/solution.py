@@ -20,6 +20,7 @@ from impactopt.planning.contact_replay import SOLVED_WITHIN, ContactReplay, Mode
 from impactopt.planning.gain_selection import ChosenGains
 from impactopt.planning.lazy_constraints import gear_caution, lazy_terms_of, slide, slide_caution
 from impactopt.planning.refinement import Attempt, Outcome
+from impactopt.problem.feasibility import overlapping
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
@@ -324,7 +325,8 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(self.slide), self.window))):
+        cautions = (out.get("caution"), slide_caution(self.slide), self.window, overlapping(self.problem))
+        if caution := " ".join(filter(None, cautions)):
             out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *replayed])
 

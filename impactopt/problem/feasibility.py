@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 
 from impactopt.bodies.clearance import Places, Touch
 from impactopt.contact.targets import Nail
-from impactopt.errors import InputError
+from impactopt.errors import InputError, counted
 from impactopt.kinematics.inverse_kinematics import Reach, inverse_kinematics, reach
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.kinematics.support import support_polygon
@@ -107,6 +107,19 @@ def sticks_out(problem: ImpactProblem) -> list[str]:
         for striker, face in faces.items()
         if face is not None and face.ahead > AHEAD
     ]
+
+
+def overlapping(problem: ImpactProblem) -> str:
+    """Message about links, no neighbours, that touch at the start and so are not kept apart; else ""."""
+    pairs = problem.bodies.overlaps if problem.self_collision.enabled else []
+    if not pairs:
+        return ""
+    named = [f"{one!r} and {other!r}" for one, other in pairs[:3]]
+    more = [f"{counted(len(pairs) - 3, 'more pair')}"] if len(pairs) > 3 else []
+    return (
+        f"links touch in the start posture and may penetrate each other in the motion: "
+        f"{', '.join(named + more)}; start from another posture, or name them in disable_collisions"
+    )
 
 
 def unusual(problem: ImpactProblem) -> list[str]:

@@ -177,7 +177,7 @@ def strike_problem(
                 start=start,
                 **given,
             )
-            if touches(problem, start, impact.q):
+            if problem.bodies.overlaps or touches(problem, start, impact.q):
                 continue
             if _hits_base(problem, impact):
                 return None  # whatever the start

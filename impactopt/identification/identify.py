@@ -12,7 +12,7 @@ from impactopt.contact.laws import LAWS, ContactLaw
 from impactopt.errors import InputError, check_choice, check_number
 from impactopt.identification.fitting import fit_law
 from impactopt.identification.free_parameters import sample_law
-from impactopt.identification.log import ImpactLog, find_impacts, read_log
+from impactopt.identification.log import ImpactLog, find_impacts, force_offset, read_log
 from impactopt.identification.result import Identification
 from impactopt.robots.robot import Robot
 
@@ -71,6 +71,7 @@ def identify(
         clipped=tuple(int(impact.clipped.sum()) for impact in impacts),
         top=max(impact.peak for impact in impacts),
         weak=weak,
+        force_offset=force_offset(impacts),
         level=level,
         target_mass=float(target_mass),
         model_mass=tuple(impact.model_mass for impact in impacts),

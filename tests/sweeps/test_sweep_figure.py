@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 from impactopt import InputError
 from impactopt.cli.app import app
 from impactopt.report.pictures.style import model_colour
-from impactopt.report.pictures.sweep import sweep_picture
+from impactopt.report.pictures.sweep import drawn_table, sweep_picture
 from impactopt.report.pictures.sweep_columns import Columns
-from impactopt.sweeps import read_sweep_file, sweep_from_data
+from impactopt.sweeps import read_sweep_file, sweep, sweep_from_data
 from impactopt.sweeps.sections import Figure
-from impactopt.sweeps.table import read_columns, unit_of, without_unit
+from impactopt.sweeps.table import read_columns, read_units, unit_of, without_unit
 
 STUDIES = sorted((Path(__file__).resolve().parents[2] / "problems" / "sweeps").glob("collision_*.toml"))
 SPEED, MASS = "at_contact.speed_m_s", "target.mass_kg"
@@ -242,6 +242,62 @@ def test_the_command_draws(tmp_path: Path) -> None:
     assert len(read_columns(table, ["impulse_Ns"])["impulse_Ns"]) == 6
     with pytest.raises(InputError, match="did you mean 'impulse_Ns'"):
         read_columns(table, ["impulse_N"])
+
+
+PRESS = """<robot name="press">
+<link name="base"/>
+<joint name="slide" type="prismatic"><parent link="base"/><child link="ram"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" effort="300" velocity="3"/></joint>
+<link name="ram"><inertial><mass value="3"/>
+<inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</robot>"""
+
+
+@pytest.mark.slow
+def test_a_prismatic_joint_has_metres(tmp_path: Path) -> None:
+    """In the table and the picture: moved by metres, with a servo in N s/m."""
+    (tmp_path / "press.urdf").write_text(PRESS, encoding="utf-8")
+    (tmp_path / "press.toml").write_text(
+        """
+        [problem]
+        striker = "ram"
+        point_m = [0.0, 0.0, 0.0]
+        normal = [1.0, 0.0, 0.0]
+        start = "zero"
+        [robot]
+        urdf = "press.urdf"
+        floating = false
+        kd_N_m_s_rad.slide = 100.0
+        [[robot.strikers]]
+        name = "ram"
+        frame = "ram"
+        point_m = [0.0, 0.0, 0.0]
+        [robot.postures_rad.zero]
+        slide = 0.0
+        [target]
+        mass_kg = 1.0
+        [contact]
+        stiffness_N_m = 1e4
+        damping_N_s_m = 100.0
+        """,
+        encoding="utf-8",
+    )
+    place, gain = "at_contact.joints_rad.slide", "robot.kd_N_m_s_rad.slide"
+    study = sweep_from_data(
+        {
+            "sweep": {"problem": str(tmp_path / "press.toml"), "case_kind": "collision"},
+            "at_contact": {"speed": 1.0},
+            "grid": {"at_contact.joints_rad.slide": [0.0, 0.1], "robot.kd.slide": [100.0, 200.0]},
+            "figure": {"kind": "lines", "x": place, "y": "impulse_Ns", "colour": gain},
+        }
+    )
+    table = sweep(study, tmp_path / "out", workers=1, progress=False).table
+    units = read_units(table)
+    assert (units[place], units[gain], units["impulse_Ns"]) == ("m", "N s/m", "N s")
+    assert study.figure is not None
+    drawn = drawn_table(study.figure, table)
+    assert drawn.axes[0].get_xlabel() == "slide moved by [m]"
+    assert drawn.legends[0].get_title().get_text() == "kd slide [N s/m]"
 
 
 @pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)

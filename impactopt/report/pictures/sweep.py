@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from impactopt.report.pictures.sweep_columns import (
 )
 from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.sections import Figure as Section
-from impactopt.sweeps.table import read_columns
+from impactopt.sweeps.table import read_columns, read_units
 
 Array = NDArray[np.float64]
 
@@ -69,21 +69,22 @@ def save_sweep_picture(sweep: Sweep, table: Path) -> Path | None:
 
 def drawn_table(section: Section, table: Path) -> Picture:
     """Picture of a table's file, as `sweep_picture`."""
-    return sweep_picture(section, read_columns(table, (*section.columns, "reason")))
+    return sweep_picture(section, read_columns(table, (*section.columns, "reason")), read_units(table))
 
 
 @styled
-def sweep_picture(section: Section, columns: Columns) -> Picture:
+def sweep_picture(section: Section, columns: Columns, units: Mapping[str, str] | None = None) -> Picture:
     """Picture of a sweep's table.
 
-    columns : of the table by name: those that `section` names, and `reason`.
+    columns : of the table by name: those that `section` names, and `reason`.  units : of the columns; None:
+    those in their names.
 
     Raises
     ------
     InputError : a heatmap of cases that form no grid; columns that must be numbers and are not; no reference
         cases for errors.
     """
-    data = SweepColumns(section, columns)
+    data = SweepColumns(section, columns, units)
     if section.drawn_as == "heatmap":
         figure = _heatmap(section, data)
     elif section.drawn_as == "lines":

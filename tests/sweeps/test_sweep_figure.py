@@ -81,6 +81,23 @@ def test_a_heatmap_has_each_row_in_its_place() -> None:
     assert "elbow would be beyond its limit" in figure.legends[0].get_texts()[0].get_text()
 
 
+@pytest.mark.parametrize(
+    ("masses", "log"), [([0.5, 1.0, 4.0], []), ([1.0, 10.0, 1e3], ["x"]), ([2.0], []), ([2.0], ["x"])]
+)
+def test_a_heatmaps_cells_are_around_their_values(masses: list[float], log: list[str]) -> None:
+    """A cell ends half-way to the next value on the axis, and a single value has a cell too."""
+    mass, speed = (x.ravel() for x in np.meshgrid(masses, [1.0, 2.0], indexing="ij"))
+    columns = {SPEED: speed, MASS: mass, "impulse_Ns": speed * mass, "reason": [""] * len(mass)}
+    axes = picture(columns, kind="heatmap", x=MASS, y=SPEED, colour="impulse_Ns", log=log).axes[0]
+    edges = axes.collections[0].get_coordinates()[0, :, 0]
+    assert (edges[:-1] < masses).all() and (masses < edges[1:]).all()
+    on_axis = np.log if log else np.asarray
+    middles = (on_axis(masses)[1:] + on_axis(masses)[:-1]) / 2
+    np.testing.assert_allclose(on_axis(edges)[1:-1], middles)
+    low, high = axes.get_xlim()
+    assert low < masses[0] and masses[-1] < high
+
+
 def test_a_contour_is_where_the_level_is() -> None:
     columns = grid_columns()
     columns["reason"] = [""] * 6

@@ -115,7 +115,8 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
         table[~np.isfinite(table)] = np.nan
         axes.set_facecolor(NO_RESULT)
         mesh = axes.pcolormesh(
-            across, up, np.ma.masked_invalid(table), shading="nearest", cmap=SCALE, rasterized=True,
+            _edges(across, "x" in section.log), _edges(up, "y" in section.log),
+            np.ma.masked_invalid(table), cmap=SCALE, rasterized=True,
             norm=LogNorm() if "colour" in section.log and (table > 0).any() else None,
         )  # fmt: skip
         axes.grid(visible=False)
@@ -129,7 +130,7 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
     panels[0].set_ylabel(data.label(section.y[0]))
     handles: list[Any] = []
     if data.reasons:
-        handles.append(Patch(facecolor=NO_RESULT, label=f"no collision: {data.note()}"))
+        handles.append(Patch(facecolor=NO_RESULT, label=f"no result: {data.note()}"))
     for dashes, (column, level) in zip(DASHES, section.contour.items(), strict=False):
         what, _, unit = data.label(column).partition(" [")
         label = f"{what} {level:g} {unit.rstrip(']')}".rstrip()
@@ -137,6 +138,16 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
     if handles:
         figure.legend(handles=handles, loc="outside lower left", ncols=min(len(handles), 2))
     return figure
+
+
+def _edges(values: Array, log: bool) -> Array:
+    """Edges (k + 1,) of cells around increasing values (k,), half-way between them on the axis."""
+    log = log and values[0] > 0
+    x = np.log(values) if log else values
+    # a single value has a cell too
+    step = np.diff(x) if len(x) > 1 else np.array([1.0 if log else abs(x[0]) or 1.0])
+    edges = np.concatenate([x - step[[0, *range(len(x) - 1)]] / 2, [x[-1] + step[-1] / 2]])
+    return np.exp(edges) if log else edges
 
 
 def _contour(

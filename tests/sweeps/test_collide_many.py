@@ -425,7 +425,11 @@ def test_what_is_impossible_says_why() -> None:
         ({}, {"posture": "redy"}, "did you mean 'ready'"),
         ({}, {"posture": "ready", "result": "there"}, "give one of them"),
         ({}, {"model": "virtual-mass", "freezes": 2}, "freezes"),
-        ({"at_contact.freezes": [10**9]}, {}, "freezes: 1000000000; give a number .* 64"),  # it took all memory
+        (
+            {"at_contact.freezes": [10**9]},
+            {},
+            "freezes: 1000000000; give a number .* 64",
+        ),  # it took all memory
     ],
 )
 def test_mistakes_are_told_before_work_starts(

@@ -152,6 +152,35 @@ def test_lines_are_in_the_order_of_x_and_apart_by_colour() -> None:
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
 
 
+@pytest.mark.parametrize("kind", ["lines", "scatter"])
+@pytest.mark.parametrize("text", [True, False])
+def test_a_legend_of_many_is_on_the_page_and_its_colours_are_distinct(kind: str, text: bool) -> None:
+    """Its row ended at the page's edge, and every eighth line had the colour of the first."""
+    many = 30
+    of = np.repeat(np.arange(many) + 0.5, 2)
+    columns: dict[str, Any] = {
+        MASS: np.array([f"robot number {x:g}" for x in of], dtype=object) if text else of,
+        SPEED: np.tile([1.0, 2.0], many),
+        "impulse_Ns": of,
+        "reason": [""] * (2 * many),
+    }
+    drawn = picture(columns, kind=kind, x=SPEED, y="impulse_Ns", colour=MASS)
+    if kind == "scatter" and not text:
+        assert not drawn.legends  # it has a bar
+        return
+    drawn.draw_without_rendering()
+    (legend,) = drawn.legends
+    box = legend.get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= drawn.bbox.x1 and box.y0 >= 0
+    names = [entry.get_text() for entry in legend.get_texts()]
+    first, last = ("robot number 0.5", "robot number 29.5") if text else ("0.5", "29.5")
+    assert names[0] == first and names[-1] == last and (len(names) == many or not text)
+    axes = drawn.axes[0]
+    marks = axes.lines if kind == "lines" else axes.collections
+    colours = [tuple(np.ravel(m.get_color() if kind == "lines" else m.get_facecolor())) for m in marks]
+    assert len(set(colours)) == many
+
+
 def test_errors_are_against_the_row_with_the_same_rest() -> None:
     models = ["sdc", "sdc", "full", "full", "sdc", "full"]
     columns = {

@@ -46,6 +46,8 @@ COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
 NO_RESULT = "#d9d9d9"  # colour of cases without a result
 MAX_MARKED = 25  # points of a line that are marked; longer lines have no marks
+MAX_LISTED = 8  # shades in a legend; of more, some are listed
+LEGEND_WIDTH, HANDLE_WIDTH = 120, 8  # characters of a row of the legend, and of the mark before a label
 MAX_POINTS = 20_000  # of a scatter plot: more are no clearer
 SCALE = "cividis"
 MODEL, FREEZES = "at_contact.model", "at_contact.freezes"
@@ -192,11 +194,24 @@ def _lines(section: Section, data: SweepColumns) -> Picture:
         grid[-1, k].set_xlabel(data.label(section.x))
     if len(legend) > 1:
         above = data.label(section.colour[0]) if len(section.colour) == 1 else None
-        handles = list(legend.values())
-        figure.legend(
-            handles, list(legend), loc="outside lower left", title=above, alignment="left", ncols=len(legend)
-        )
+        shown = list(legend.items())
+        if _shaded(section, data) and len(shown) > MAX_LISTED:
+            shown = [shown[round(k)] for k in np.linspace(0, len(shown) - 1, MAX_LISTED)]
+        _legend(figure, [line for _, line in shown], [name for name, _ in shown], above)
     return figure
+
+
+def _legend(figure: Picture, handles: Sequence[Any], labels: Sequence[str], title: str | None) -> None:
+    """Legend below the panels, in as many rows as its labels need."""
+    widths = [len(label) + HANDLE_WIDTH for label in labels]
+    room = LEGEND_WIDTH * figure.get_figwidth() / PAGE
+    columns = len(labels) if sum(widths) <= room else max(int(room / max(widths)), 1)
+    figure.legend(handles, labels, loc="outside lower left", title=title, alignment="left", ncols=columns)
+
+
+def _shaded(section: Section, data: SweepColumns) -> bool:
+    """True if lines have the shades of one number."""
+    return len(section.colour) == 1 and data.values(section.colour[0]).dtype != object
 
 
 def _shades(
@@ -207,10 +222,12 @@ def _shades(
         again = data.numbers(FREEZES) if FREEZES in section.colour else np.zeros(len(groups))
         first = [int(np.argmax(groups == g)) for g in range(len(names))]
         return [model_colour(data.values(MODEL)[k], again[k]) for k in first]
-    one = len(section.colour) == 1 and data.values(section.colour[0]).dtype != object
-    if one and len(names) > 2:
-        return [colormaps[SCALE](0.9 * k / (len(names) - 1)) for k in range(len(names))]
-    return [COLOURS[k % len(COLOURS)] for k in range(len(names))]
+    return _colours(len(names), 2 if _shaded(section, data) else len(COLOURS))
+
+
+def _colours(count: int, most: int = len(COLOURS)) -> list[Any]:
+    """Distinct colours; shades of one scale, if they are more than `most`."""
+    return [colormaps[SCALE](0.9 * k / (count - 1)) if count > most else COLOURS[k] for k in range(count)]
 
 
 # ---------------------------------------------------------------- scatter
@@ -238,7 +255,7 @@ def _scatter(section: Section, data: SweepColumns) -> Picture:
         own = drawn[panel[drawn] == k]
         for g, series in enumerate(names):
             some = own[groups[own] == g]
-            paint: dict[str, Any] = {"color": COLOURS[g % len(COLOURS)], "label": series}
+            paint: dict[str, Any] = {"color": _colours(len(names))[g], "label": series}
             if numeric and colour is not None:
                 paint = {"c": data.numbers(colour)[some], "cmap": SCALE, "norm": norm}
             marks = axes.scatter(x[some], y[some], s=size, edgecolors="none", rasterized=True, **paint)
@@ -251,7 +268,7 @@ def _scatter(section: Section, data: SweepColumns) -> Picture:
         bar.outline.set_visible(False)
     elif len(names) > 1 and colour is not None:
         handles, labels = grid[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower left", title=data.label(colour), ncols=len(labels))
+        _legend(figure, handles, labels, data.label(colour))
     if shown.sum() > len(drawn):
         figure.supxlabel(f"{len(drawn):,} of {shown.sum():,} rows", fontsize=7, x=0.01, ha="left")
     return figure

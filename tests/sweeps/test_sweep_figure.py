@@ -244,6 +244,24 @@ def test_what_a_figure_names_has_to_be_there() -> None:
         sweep_from_data(collisions_data(kind="heat map"))
 
 
+@pytest.mark.parametrize(
+    ("figure", "says"),
+    [
+        ({"kind": "lines", "y": "impulse_Ns", "contour": {"impulse_Ns": 1.0}}, "contour: of kind = 'heatm"),
+        ({"panel": "target.mass"}, "panel: of kind = 'lines' or 'scatter' only, not 'heatmap'"),
+        ({"kind": "scatter", "against": {"target.mass": 1.0}}, "against: of kind = 'lines' only"),
+        ({"kind": "scatter", "y": ["impulse_Ns", "target.mass"]}, "y: several are of kind = 'lines' only"),
+        ({"kind": "scatter", "colour": ["impulse_Ns", "target.mass"]}, "colour: several are of"),
+        ({"contour": {"impulse_Ns": 1.0, "peak_force_N": 1.0, "target.mass": 1.0, "at_contact.speed": 1.0}},
+         "4 lines; give at most 3"),
+    ],
+)  # fmt: skip
+def test_what_a_figures_kind_does_not_draw_is_refused(figure: dict[str, Any], says: str) -> None:
+    """It was left out silently."""
+    with pytest.raises(InputError, match=rf"\[figure\] .*{says}"):
+        sweep_from_data(collisions_data(**figure))
+
+
 def test_what_a_figure_of_plans_names_has_to_be_there() -> None:
     """Told before a case is solved; columns of target, objectives and scenarios are known by prefixes."""
     names = ("target.mass", "impulse_Ns", "target_speed_m_s", "torque_ratio_swing", "heavy_slow_impulse_Ns")

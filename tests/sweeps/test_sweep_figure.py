@@ -152,6 +152,22 @@ def test_lines_are_in_the_order_of_x_and_apart_by_colour() -> None:
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
 
 
+def test_errors_against_several_rows_at_one_place_are_refused() -> None:
+    """The last of them was the reference of all."""
+    columns = {
+        SPEED: [1.0, 1.0, 1.0, 1.0],
+        MASS: [0.5, 0.5, 2.0, 2.0],
+        "at_contact.model": ["full", "sdc", "full", "sdc"],
+        "impulse_Ns": [1.0, 1.1, 2.0, 2.1],
+        "reason": [""] * 4,
+    }
+    given = {"kind": "lines", "x": SPEED, "y": "impulse_Ns", "against": {"at_contact.model": "full"}}
+    with pytest.raises(InputError, match=r"several rows with .* have the same at_contact.speed_m_s"):
+        picture(columns, **given, colour="at_contact.model")
+    panels = picture(columns, **given, colour="at_contact.model", panel=MASS).axes
+    assert [axes.lines[0].get_ydata()[0] for axes in panels] == pytest.approx([10.0, 5.0])
+
+
 @pytest.mark.parametrize("kind", ["lines", "scatter"])
 @pytest.mark.parametrize("text", [True, False])
 def test_a_legend_of_many_is_on_the_page_and_its_colours_are_distinct(kind: str, text: bool) -> None:

@@ -98,7 +98,14 @@ def errors_against(section: Section, data: SweepColumns, values: Array) -> Array
         raise InputError(f"[figure] against: no row has {section.against}")
     shared = [section.x, *([section.panel] if section.panel else [])]
     points = list(zip(*[data.values(name).tolist() for name in shared], strict=True))
-    reference = {points[i]: values[i] for i in np.flatnonzero(base)}
+    reference: dict[tuple[Any, ...], float] = {}
+    for i in np.flatnonzero(base & np.isfinite(values)):
+        if reference.setdefault(points[i], values[i]) != values[i]:
+            raise InputError(
+                f"[figure] against: several rows with {section.against} have the same "
+                f"{' and '.join(shared)}, and other results; take the key in which they differ as the panel, "
+                "or give it one value"
+            )
     true = np.array([reference.get(point, np.nan) for point in points])
     error = np.where(base, np.nan, 100 * (values / true - 1))
     return np.abs(error) if "y" in section.log else error

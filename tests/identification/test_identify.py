@@ -22,6 +22,7 @@ from impactopt import (
     HuntCrossley,
     ImpactLog,
     InputError,
+    KelvinVoigt,
     SpringDamper,
     VirtualMass,
     effective_mass,
@@ -336,6 +337,8 @@ def test_logs_that_cannot_be_used_are_refused() -> None:
     [
         ({"laws": ["Hunt-Crosley"]}, "did you mean 'Hunt-Crossley'"),
         ({"laws": []}, "at least one"),
+        ({"laws": "Hertzian"}, "no law 'Hertzian'"),
+        ({"laws": None}, "at least one"),
         ({"level": 1.0}, "between 0 and 1"),
         ({"target_mass": 0.0}, "a number > 0"),
     ],
@@ -343,6 +346,16 @@ def test_logs_that_cannot_be_used_are_refused() -> None:
 def test_options_that_mean_nothing_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         identify(changed(), **options)
+
+
+def test_a_single_law_is_no_list_and_a_table_no_log() -> None:
+    log = changed()
+    (fit,) = identify(log, laws="Kelvin-Voigt").fits
+    (same,) = identify(log, laws=KelvinVoigt).fits
+    assert fit.name == "Kelvin-Voigt" and fit.law == same.law
+    wrong: Any = {"time_s": log.time, "force_N": log.force, "hand_speed_m_s": log.speed}
+    with pytest.raises(InputError, match=r"of type dict; give a file, or ImpactLog"):
+        identify(wrong)
 
 
 @pytest.mark.parametrize(

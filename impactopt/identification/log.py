@@ -232,6 +232,7 @@ def _joint(columns: Columns, robot: Robot, k: int, name: str) -> Array:
 _MIN_CONTACT_FORCE, _MIN_PEAK = 0.1, 0.2  # of contact, and of an impact's peak, over the log's largest force
 _MIN_REPORTED = 0.02  # of a weaker contact that is reported as left out, over the largest force
 _MIN_SAMPLES = 8  # in contact
+_MIN_CHANGES = 4  # of a value in contact, to tell if it is repeated
 _MAX_GAP = 0.05  # without force in a contact, over its length: in a dense log that is many samples of noise
 # A top is flat if at least so many samples in a row are within this fraction of the noise, or of the peak.
 # A force that is cut off is constant to rounding; a round top of a dense log without noise is not.
@@ -410,11 +411,17 @@ def _impact(
         near = begin + np.flatnonzero((clipped | (f > f.max() - _NEAR_CUT * noise))[begin:end])
         clipped = clipped.copy()
         clipped[near[0] : near[-1] + 1] = True
+    motion = log.travel if log.speed is None else log.speed
+    assert motion is not None
+    for key, values in ((FORCE, f), (SPEED if log.travel is None else "the motion", motion)):
+        if (times := _repeats(values[begin:end])) > 1:
+            raise InputError(
+                f"{where}: each value of {key} is repeated some {times} times, as if it were sampled at a "
+                "lower rate than the log: keep one row for each of its values"
+            )
     low = int(np.searchsorted(t, t[begin] - _BEFORE * duration))
     high = int(np.searchsorted(t, t[end] + _AFTER * duration, side="right"))
     low, high = max(min(low, begin - 5), before, 0), min(max(high, end + 5), after, len(t))
-    motion = log.travel if log.speed is None else log.speed
-    assert motion is not None
     mean = _mean_slope if log.speed is None else _mean
     speed = mean(t[low:begin], motion[low:begin])
     if np.isnan(speed):
@@ -450,6 +457,17 @@ def _impact(
         mass=mass,
         model_mass=np.nan if log.model_mass is None else float(log.model_mass[begin]),
     )
+
+
+def _repeats(values: Array) -> int:
+    """Number of rows with each value of a history, if a slower sensor has been held; else 1."""
+    changes = np.diff(values)
+    at = np.flatnonzero(changes)
+    if len(at) < _MIN_CHANGES or np.quantile(np.diff(at), 0.1) < 2:
+        return 1
+    # a coarse converter repeats values too, and then changes by single steps
+    sizes = np.abs(changes[at])
+    return round(np.median(np.diff(at))) if np.median(sizes) > 1.5 * sizes.min() else 1
 
 
 def _mean(time: Array, speed: Array) -> float:

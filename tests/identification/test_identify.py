@@ -154,6 +154,24 @@ def test_contacts_between_which_the_force_stays_are_refused() -> None:
         identify(ImpactLog(time=t, force=force, speed=speed))
 
 
+@pytest.mark.parametrize("column", ["force", "speed"])
+@pytest.mark.parametrize("times", [2, 10])
+def test_values_of_a_slower_sensor_that_are_repeated_are_refused(column: str, times: int) -> None:
+    """Held force was taken for a cut-off one, and its stiffness was up to 9 % off."""
+    log = log_of(TrueBlow("Kelvin-Voigt"), seed=1)
+    rows = np.arange(len(log.time)) // times * times
+    held = dataclasses.replace(log, **{column: getattr(log, column)[rows]})
+    with pytest.raises(InputError, match=rf"{column}\w* is repeated some {times} times.*keep one row"):
+        identify(held)
+
+
+@pytest.mark.parametrize("step", [0.01, 0.1])
+def test_a_coarse_speed_is_not_taken_for_a_repeated_one(step: float) -> None:
+    log = log_of(TrueBlow("Kelvin-Voigt"), noise=0.0, rate=3e4)
+    assert log.speed is not None
+    find_impacts(dataclasses.replace(log, speed=np.round(log.speed / step) * step))
+
+
 def test_an_offset_of_the_force_is_told() -> None:
     """1 % of the peak makes the mass too large by more than its interval, and residuals hardly show it."""
     log = log_of(TrueBlow("Kelvin-Voigt", mass=MASS), seed=3)

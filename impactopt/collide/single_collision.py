@@ -27,6 +27,7 @@ from impactopt.files.sections.values import Positive, Section
 from impactopt.files.toml import read_toml
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin, zmp
+from impactopt.problem.checks import MOST_FREEZES
 from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import Status
@@ -61,7 +62,7 @@ class AtContact(Section):
     kd_scale: Positive = 1.0
     torque_limit_scale: Positive = 1.0
     model: Literal["rigid", "virtual-mass", "sdc-paper", "sdc", "full"] = "sdc"
-    freezes: int = Field(default=0, ge=0)
+    freezes: int = Field(default=0, ge=0, le=MOST_FREEZES)
     horizon: Positive = Field(default=0.2, alias="horizon_s")
 
 

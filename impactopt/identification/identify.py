@@ -12,7 +12,7 @@ from impactopt.contact.laws import LAWS, ContactLaw
 from impactopt.errors import InputError, check_choice, check_number
 from impactopt.identification.fitting import fit_law
 from impactopt.identification.free_parameters import sample_law
-from impactopt.identification.log import ImpactLog, find_impacts, read_log
+from impactopt.identification.log import ImpactLog, find_impacts, force_offset, read_log
 from impactopt.identification.result import Identification
 from impactopt.robots.robot import Robot
 
@@ -20,7 +20,7 @@ from impactopt.robots.robot import Robot
 def identify(
     log: ImpactLog | str | os.PathLike[str],
     *,
-    laws: Sequence[str | type[ContactLaw] | ContactLaw] = LAWS,
+    laws: str | type[ContactLaw] | ContactLaw | Sequence[str | type[ContactLaw] | ContactLaw] = LAWS,
     target_mass: float = np.inf,
     level: float = 0.95,
     robot: Robot | None = None,
@@ -40,8 +40,8 @@ def identify(
     Parameters
     ----------
     log : measured; or a file, as in `read_log`, which also takes `robot`, `striker` and `normal`.
-    laws : to fit: their words in problem files, classes, or laws with fixed parameters, such as another
-        exponent. All parameters of a `CustomLaw` are fitted, with its values as initial guess.
+    laws : to fit, or a single one: their words in problem files, classes, or laws with fixed parameters, such
+        as another exponent. All parameters of a `CustomLaw` are fitted, with its values as initial guess.
     target_mass : [kg] of a free target; infinite for a fixed one, such as a load cell on a wall.
     level : of the intervals.
 
@@ -55,11 +55,16 @@ def identify(
         raise InputError(
             f"target_mass [kg]: {target_mass:g}; give a number > 0, or infinity for a fixed target"
         )
-    chosen = [_law(law) for law in laws]
+    given = [laws] if isinstance(laws, (str, type, ContactLaw)) else laws or ()
+    chosen = [_law(law) for law in given]
     if not chosen:
         raise InputError("laws: none; give at least one")
     if isinstance(log, ImpactLog):
         measured = log
+    elif not isinstance(log, (str, os.PathLike)):
+        raise InputError(
+            f"log: this is of type {type(log).__name__}; give a file, or ImpactLog(time=, force=, speed=)"
+        )
     else:
         measured = read_log(log, robot=robot, striker=striker, normal=normal)
     impacts, weak = find_impacts(measured)
@@ -71,6 +76,7 @@ def identify(
         clipped=tuple(int(impact.clipped.sum()) for impact in impacts),
         top=max(impact.peak for impact in impacts),
         weak=weak,
+        force_offset=force_offset(impacts),
         level=level,
         target_mass=float(target_mass),
         model_mass=tuple(impact.model_mass for impact in impacts),

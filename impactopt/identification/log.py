@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import trapezoid
 
 from impactopt.codegen.files import read_archive
-from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, shortened
+from impactopt.errors import (
+    MOST,
+    InputError,
+    check_array,
+    check_direction,
+    counted,
+    did_you_mean,
+    shortened,
+)
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.robots.robot import Robot
 
@@ -224,13 +232,21 @@ def _joint(columns: Columns, robot: Robot, k: int, name: str) -> Array:
 _MIN_CONTACT_FORCE, _MIN_PEAK = 0.1, 0.2  # of contact, and of an impact's peak, over the log's largest force
 _MIN_REPORTED = 0.02  # of a weaker contact that is reported as left out, over the largest force
 _MIN_SAMPLES = 8  # in contact
+_MIN_CHANGES = 4  # of a value in contact, to tell if it is repeated
+_MAX_GAP = 0.05  # without force in a contact, over its length: in a dense log that is many samples of noise
 # A top is flat if at least so many samples in a row are within this fraction of the noise, or of the peak.
 # A force that is cut off is constant to rounding; a round top of a dense log without noise is not.
 _FLAT_SAMPLES, _NOISE_FRACTION, _PEAK_FRACTION = 4, 0.1, 1e-12
 # Except for quantization: within half the length of a quantized top beyond its ends, a parabola falls by 3
 # steps; a force that is cut off falls by more than so many.
 _QUANTIZATION_STEPS = 6.0
+_NOISE_STEPS = 30.0  # of the noise, over a converter's
+# Samples of an impact between the first and the last within so many deviations of a cut are left out: at the
+# top those with noise downward would be left only.
+_NEAR_CUT = 3.0
 _BEFORE, _AFTER = 0.5, 0.25  # fitted times before the touch and after the end, over the contact's duration
+_RISE = 0.1  # time before the first sample in contact in which force may begin, over the contact's duration
+_MIN_OFFSET_ERRORS, _MIN_OFFSET = 4.0, 5e-4  # of a force's offset, over its standard error and the peak
 # limits beyond which other units are suspected
 _MAX_DURATION, _MAX_SPEED, _MIN_MASS, _MAX_MASS = 1.0, 50.0, 1e-3, 1e4  # s, m/s, kg, kg
 
@@ -269,6 +285,9 @@ def _clipped(force: Array) -> NDArray[np.bool_]:
     top = float(force.max())
     at_top = force >= top - max(_NOISE_FRACTION * noise_of(force), _PEAK_FRACTION * top)
     step = float(np.diff(np.unique(force)).min(initial=np.inf))
+    # noise that many steps of a converter are in leaves no equal samples at a top that is not cut off
+    if np.sum(force >= top * (1 - _PEAK_FRACTION)) >= _FLAT_SAMPLES and noise_of(force) > _NOISE_STEPS * step:
+        return at_top
     for begin, end in np.flatnonzero(np.diff(np.concatenate([[0], at_top, [0]]))).reshape(-1, 2):
         beyond = (end - begin) // 2
         sides = [force[k] for k in (begin - 1 - beyond, end + beyond) if 0 <= k < len(force)]
@@ -309,6 +328,9 @@ def find_impacts(log: ImpactLog) -> tuple[tuple[MeasuredImpact, ...], tuple[floa
         raise InputError(f"{name}: no contact: {FORCE} is at most {peak:.4g} N, as large as its noise")
     spans = _spans(log.force, max(_MIN_CONTACT_FORCE * peak, 4.5 * noise))
     spans = [span for span in spans if log.force[slice(*span)].max() > _MIN_PEAK * peak]
+    # noise alone lifts a few samples of a long log, or of the end of a contact, above that
+    loud = [(b, e) for b, e in spans if e - b >= _MIN_SAMPLES or log.force[b:e].max() > 8 * noise]
+    spans = loud or spans
     clipped = _clipped(log.force)
     weak = tuple(
         float(log.time[begin])
@@ -318,17 +340,32 @@ def find_impacts(log: ImpactLog) -> tuple[tuple[MeasuredImpact, ...], tuple[floa
     return tuple(_impact(log, span, spans, noise, clipped) for span in spans), weak
 
 
+def force_offset(impacts: Sequence[MeasuredImpact]) -> float:
+    """Mean force [N] before the touches; 0 if it may be noise, or is negligible."""
+    early = [i.force[i.time < i.time[i.touch] - _RISE * i.duration] for i in impacts]
+    force = np.concatenate(early)
+    if len(force) < _MIN_SAMPLES:
+        return 0.0
+    mean, error = float(force.mean()), float(force.std(ddof=1)) / np.sqrt(len(force))
+    least = max(_MIN_OFFSET_ERRORS * error, _MIN_OFFSET * max(impact.peak for impact in impacts))
+    return mean if abs(mean) > least else 0.0
+
+
 def _spans(force: Array, least: float) -> list[tuple[int, int]]:
     """Spans (begin, end) of samples above a force [N]; short gaps, and gaps with force, are noise."""
     inside = force > least
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
-    spans: list[tuple[int, int]] = []
-    for begin, end in edges.reshape(-1, 2):
-        gap = force[spans[-1][1] : begin] if spans else force
-        if spans and (len(gap) <= 2 or gap.mean() > least / 2):
-            spans[-1] = (spans[-1][0], int(end))
-        else:
-            spans.append((int(begin), int(end)))
+    spans: list[tuple[int, int]] = [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
+    for _ in range(2):  # joined pieces are longer
+        pieces, spans = spans, []
+        for begin, end in pieces:
+            first, last = spans[-1] if spans else (0, 0)
+            gap = force[last:begin]
+            short = max(2.0, _MAX_GAP * max(last - first, end - begin))
+            if spans and (len(gap) <= short or gap.mean() > least / 2):
+                spans[-1] = (first, end)
+            else:
+                spans.append((begin, end))
     return spans
 
 
@@ -367,16 +404,31 @@ def _impact(
         )
     if end - begin < _MIN_SAMPLES:
         raise InputError(
-            f"{where}: {end - begin} samples in contact; at least {_MIN_SAMPLES} are needed: log at "
-            f"{1.5 * _MIN_SAMPLES / duration:.0f} Hz or more"
+            f"{where}: {counted(end - begin, 'sample')} in contact; at least {_MIN_SAMPLES} are needed: "
+            f"log at {1.5 * _MIN_SAMPLES / duration:.0f} Hz or more, or take them out if they are outliers"
         )
+    if clipped[begin:end].any():
+        near = begin + np.flatnonzero((clipped | (f > f.max() - _NEAR_CUT * noise))[begin:end])
+        clipped = clipped.copy()
+        clipped[near[0] : near[-1] + 1] = True
+    motion = log.travel if log.speed is None else log.speed
+    assert motion is not None
+    for key, values in ((FORCE, f), (SPEED if log.travel is None else "the motion", motion)):
+        if (times := _repeats(values[begin:end])) > 1:
+            raise InputError(
+                f"{where}: each value of {key} is repeated some {times} times, as if it were sampled at a "
+                "lower rate than the log: keep one row for each of its values"
+            )
     low = int(np.searchsorted(t, t[begin] - _BEFORE * duration))
     high = int(np.searchsorted(t, t[end] + _AFTER * duration, side="right"))
     low, high = max(min(low, begin - 5), before, 0), min(max(high, end + 5), after, len(t))
-    motion = log.travel if log.speed is None else log.speed
-    assert motion is not None
     mean = _mean_slope if log.speed is None else _mean
     speed = mean(t[low:begin], motion[low:begin])
+    if np.isnan(speed):
+        raise InputError(
+            f"{where}: the force has not returned to zero since the contact before it; take both "
+            "contacts out of the log"
+        )
     if not speed > 0:
         raise InputError(
             f"{where}: the hand moves at {speed:.3g} m/s before the touch; its speed towards the target is "
@@ -405,6 +457,17 @@ def _impact(
         mass=mass,
         model_mass=np.nan if log.model_mass is None else float(log.model_mass[begin]),
     )
+
+
+def _repeats(values: Array) -> int:
+    """Number of rows with each value of a history, if a slower sensor has been held; else 1."""
+    changes = np.diff(values)
+    at = np.flatnonzero(changes)
+    if len(at) < _MIN_CHANGES or np.quantile(np.diff(at), 0.1) < 2:
+        return 1
+    # a coarse converter repeats values too, and then changes by single steps
+    sizes = np.abs(changes[at])
+    return round(np.median(np.diff(at))) if np.median(sizes) > 1.5 * sizes.min() else 1
 
 
 def _mean(time: Array, speed: Array) -> float:

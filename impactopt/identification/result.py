@@ -145,6 +145,7 @@ class Identification:
     target_mass [kg] : infinite for a fixed target
     clipped, top [N] : number of samples of each impact whose force was cut off at `top`, and is not fitted
     weak : times [s] of contacts with less than 20 % of the largest force, which are not fitted
+    force_offset [N] : mean force before the touches; 0 if it may be noise
     model_mass [kg] : effective mass of each impact by the robot's model; nan if unknown
     """
 
@@ -156,6 +157,7 @@ class Identification:
     clipped: tuple[int, ...]
     top: float
     weak: tuple[float, ...] = ()
+    force_offset: float = 0.0
     model_mass: tuple[float, ...] = field(default=())
 
     def __repr__(self) -> str:
@@ -197,6 +199,11 @@ class Identification:
                 f"{counted(len(self.weak), 'contact')} with less than 20 % of the largest force left out, at "
                 f"{times}{more} s: give such impacts a log of their own"
             )
+        if self.force_offset:
+            out.append(
+                f"the force before contact is {self.force_offset:.3g} N on average: subtract this offset, "
+                "which makes all parameters wrong, by more than their intervals"
+            )
         near = [each.name for each in self.fits[1:] if each.aic - best.aic < _TIE]
         if near:
             out.append(
@@ -205,8 +212,8 @@ class Identification:
         # a fit weighs force and motion by their residuals, so what does not fit may be left in either
         coloured = [
             f"the residual {name} of {best.name}, {pct:.2g} % of the {largest}, is not white noise "
-            f"(correlation of neighbouring samples: {correlation:.2f}): {cause}, or the log is filtered; "
-            "intervals are too narrow then"
+            f"(correlation of neighbouring samples: {correlation:.2f}): {cause}, a sensor has an offset or a "
+            "delay, or the log is filtered; intervals are too narrow then"
             for name, pct, largest, correlation, cause in (
                 ("force", best.force_left_pct, "peak", best.correlation, "another law holds"),
                 (
@@ -214,7 +221,7 @@ class Identification:
                     best.motion_left_pct,
                     "largest",
                     best.motion_correlation,
-                    "another law holds, the target has another mass, or servos act",
+                    "another law holds, the target has another mass, servos act",
                 ),
             )
             if correlation > _MAX_CORRELATION / np.sqrt(self.samples) and pct > _INTERPOLATION_ERROR
@@ -244,6 +251,7 @@ class Identification:
             "samples": self.samples,
             "clipped": list(self.clipped),
             "weak_s": list(self.weak),
+            "force_offset_N": self.force_offset,
             "level": self.level,
             "target_mass_kg": self.target_mass if np.isfinite(self.target_mass) else None,
             "model_mass_kg": [x for x in self.model_mass if np.isfinite(x)],

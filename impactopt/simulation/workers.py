@@ -131,8 +131,8 @@ def each_on_workers(
                         # an exit code >= 0 is an error in the script, which every process would repeat
                         if code >= 0 or failed >= MAX_FAILED_STARTS:
                             raise InputError(
-                                f"the worker processes do not start (exit code {code}); put the call of your "
-                                'script under `if __name__ == "__main__":`, or ask for workers=1'
+                                f"the worker processes do not start (exit code {code}); put the call into a "
+                                'script\'s file, under `if __name__ == "__main__":`'
                             ) from None
                         returned.append(mine)
                     else:

@@ -397,7 +397,8 @@ class Collisions:
         folder: Path = Path(),
     ) -> None:
         self.folder = folder
-        self.file, self.at_contact, self.outputs = file, full_names(at_contact), tuple(outputs)
+        self.file, self.at_contact = file, full_names(at_contact)
+        self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         self.places = {key: sweep_place(file.data, key) for key in keys}
         if len({*self.places.values()}) < len(self.places):
             raise InputError(f"two columns are of one key: {', '.join(keys)}")

@@ -32,7 +32,16 @@ from impactopt.files.toml import (
 )
 from impactopt.sweeps.collisions import Collisions, sweep_place
 from impactopt.sweeps.design import Axis, Column, Design, Draws, Span, column
-from impactopt.sweeps.sections import Figure, SpanSection, SweepFile, SweepSection, flat, of_other_kinds, put
+from impactopt.sweeps.sections import (
+    Figure,
+    SpanSection,
+    SweepFile,
+    SweepSection,
+    flat,
+    of_other_kinds,
+    put,
+    unused_in_figure,
+)
 from impactopt.sweeps.table import PLAN_COLUMNS, PLAN_PREFIXES
 
 
@@ -386,6 +395,7 @@ def _checked(data: dict[str, Any], path: Path, text: str, lines: Mapping[Place, 
     else:
         reader.check_values(grid, listed, over)
     if content.figure is not None:
+        mistakes += unused_in_figure(content.figure)
         results, prefixes = given.outputs, tuple[str, ...]()
         if given.case_kind != "collision":
             names = (str(scenario["name"]) for scenario in base.data.get("scenarios", ()))

@@ -231,7 +231,9 @@ def _write(
         "sweep": chosen.text,
         "problem": chosen.problem.text,
     }
-    write_table(store.table, parts(), {**kinds, **counter.kinds}, metadata)
+    robot = problem.robot
+    prismatic = [name for name, slides in zip(robot.joint_names, robot.prismatic, strict=True) if slides]
+    write_table(store.table, parts(), {**kinds, **counter.kinds}, metadata, prismatic)
 
 
 def _cores() -> int:

@@ -95,6 +95,25 @@ class Figure(Section):
         return self.model_copy(update=new)
 
 
+_KINDS = {"contour": ("heatmap",), "panel": ("lines", "scatter"), "against": ("lines",)}
+MOST_CONTOURS = 3  # of a heatmap
+
+
+def unused_in_figure(figure: Figure) -> list[Mistake]:
+    """Mistakes: what the figure's kind does not draw."""
+    kind, found = figure.drawn_as, dict[str, str]()
+    for name, kinds in _KINDS.items():
+        if getattr(figure, name) and kind not in kinds:
+            found[name] = f"of kind = {' or '.join(map(repr, kinds))} only, not {kind!r}; leave it out"
+    if len(figure.y) > 1 and kind != "lines":
+        found["y"] = f"several are of kind = 'lines' only, not {kind!r}; give one"
+    if len(figure.colour) > 1 and kind == "scatter":
+        found["colour"] = "several are of kind = 'lines' or 'heatmap' only, not 'scatter'; give one"
+    if len(figure.contour) > MOST_CONTOURS:
+        found["contour"] = f"{len(figure.contour)} lines; give at most {MOST_CONTOURS}"
+    return [Mistake(place=("figure", name), sections=1, text=text) for name, text in found.items()]
+
+
 AtLeastOne = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0)]
 

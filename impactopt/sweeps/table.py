@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,16 @@ UNITS = {
     "_s": "s",
 }
 
+# of prismatic joints' values
+LINEAR_UNITS = {
+    "rad": "m",
+    "rad/s": "m/s",
+    "N m": "N",
+    "N m/rad": "N/m",
+    "N m s/rad": "N s/m",
+    "kg m^2": "kg",
+}
+
 START = "started_from"  # column with the solved case that a solve started from; "": none
 # entries of a plan's summary that are columns of the same name
 SUMMARY_COLUMNS = (
@@ -76,13 +86,18 @@ def pyarrow() -> Any:
     return pyarrow
 
 
-def unit_of(name: str) -> str:
-    """Unit in a column's name, "" for none: impulse_Ns is in N s."""
+def unit_of(name: str, prismatic: Collection[str] = ()) -> str:
+    """Unit in a column's name, "" for none: impulse_Ns is in N s.
+
+    prismatic : joints whose values are in `LINEAR_UNITS`, as at_contact.joints_rad.slide in m.
+    """
     if name.endswith("seconds"):
         return "s"
     k, end = _ending(name)
-    stiff = end == "_N_m" and name.split(".")[k].startswith(("stiffness", "hardening"))
-    return "N/m" if stiff else UNITS.get(end, "")
+    parts = name.split(".")
+    stiff = end == "_N_m" and parts[k].startswith(("stiffness", "hardening"))
+    unit = "N/m" if stiff else UNITS.get(end, "")
+    return LINEAR_UNITS.get(unit, unit) if ".".join(parts[k + 1 :]) in prismatic else unit
 
 
 def without_unit(name: str) -> str:
@@ -121,8 +136,19 @@ def read_columns(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
+def read_units(path: Path) -> dict[str, str]:
+    """Units of a table's columns by name, as `write_table` has written them."""
+    metadata = pyarrow().parquet.read_schema(path).metadata or {}
+    units: dict[str, str] = json.loads(metadata.get(b"impactopt.units", b"{}"))
+    return units
+
+
 def write_table(
-    path: Path, parts: Iterable[Part], kinds: Mapping[str, str], metadata: Mapping[str, str]
+    path: Path,
+    parts: Iterable[Part],
+    kinds: Mapping[str, str],
+    metadata: Mapping[str, str],
+    prismatic: Collection[str] = (),
 ) -> None:
     """Write a table, with rows in the order of the parts; it replaces an old file atomically.
 
@@ -131,6 +157,7 @@ def write_table(
         (`merge_kinds`).
     metadata : text by name, under `impactopt.<name>`. Each column has its unit, and `impactopt.units` has
     all.
+    prismatic : joints, as of `unit_of`.
 
     Raises
     ------
@@ -146,7 +173,7 @@ def write_table(
         "": arrow.float64(),  # a number that no case has, such as the peak force of rigid impacts
     }
     fields = [arrow.field("case", arrow.int64())]
-    units = {name: unit_of(name) for name in kinds if unit_of(name)}
+    units = {name: unit for name in kinds if (unit := unit_of(name, prismatic))}
     for name, kind in kinds.items():
         own = {"unit": units[name]} if name in units else None
         fields.append(arrow.field(name, types[kind], metadata=own))

@@ -426,6 +426,11 @@ def test_what_is_impossible_says_why() -> None:
         ({}, {"posture": "redy"}, "did you mean 'ready'"),
         ({}, {"posture": "ready", "result": "there"}, "give one of them"),
         ({}, {"model": "virtual-mass", "freezes": 2}, "freezes"),
+        (
+            {"at_contact.freezes": [10**9]},
+            {},
+            "freezes: 1000000000; give a number .* 64",
+        ),  # it took all memory
     ],
 )
 def test_mistakes_are_told_before_work_starts(
@@ -449,6 +454,8 @@ def test_mistakes_in_what_is_asked_for() -> None:
         collide_many(arm_file(), {})
     with pytest.raises(InputError, match="did you mean 'impulse_Ns'"):
         collide_many(arm_file(), {}, outputs=("impulse",), at_contact={"speed_m_s": 1.0})
+    with pytest.raises(InputError, match="did you mean 'impulse_Ns'"):
+        collide_many(arm_file(), {}, outputs="impulse", at_contact={"speed_m_s": 1.0})
     with pytest.raises(InputError, match="soles"):
         collide_many(arm_file(), {}, outputs=("zmp_margin_m",), at_contact={"speed_m_s": 1.0})
     for model, what in (("rigid", "a rigid impact"), ("virtual-mass", "a point mass")):

@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 from impactopt import InputError
 from impactopt.cli.app import app
 from impactopt.report.pictures.style import model_colour
-from impactopt.report.pictures.sweep import sweep_picture
+from impactopt.report.pictures.sweep import drawn_table, sweep_picture
 from impactopt.report.pictures.sweep_columns import Columns
-from impactopt.sweeps import read_sweep_file, sweep_from_data
+from impactopt.sweeps import read_sweep_file, sweep, sweep_from_data
 from impactopt.sweeps.sections import Figure
-from impactopt.sweeps.table import read_columns, unit_of, without_unit
+from impactopt.sweeps.table import read_columns, read_units, unit_of, without_unit
 
 STUDIES = sorted((Path(__file__).resolve().parents[2] / "problems" / "sweeps").glob("collision_*.toml"))
 SPEED, MASS = "at_contact.speed_m_s", "target.mass_kg"
@@ -81,6 +81,23 @@ def test_a_heatmap_has_each_row_in_its_place() -> None:
     assert "elbow would be beyond its limit" in figure.legends[0].get_texts()[0].get_text()
 
 
+@pytest.mark.parametrize(
+    ("masses", "log"), [([0.5, 1.0, 4.0], []), ([1.0, 10.0, 1e3], ["x"]), ([2.0], []), ([2.0], ["x"])]
+)
+def test_a_heatmaps_cells_are_around_their_values(masses: list[float], log: list[str]) -> None:
+    """A cell ends half-way to the next value on the axis, and a single value has a cell too."""
+    mass, speed = (x.ravel() for x in np.meshgrid(masses, [1.0, 2.0], indexing="ij"))
+    columns = {SPEED: speed, MASS: mass, "impulse_Ns": speed * mass, "reason": [""] * len(mass)}
+    axes = picture(columns, kind="heatmap", x=MASS, y=SPEED, colour="impulse_Ns", log=log).axes[0]
+    edges = axes.collections[0].get_coordinates()[0, :, 0]
+    assert (edges[:-1] < masses).all() and (masses < edges[1:]).all()
+    on_axis = np.log if log else np.asarray
+    middles = (on_axis(masses)[1:] + on_axis(masses)[:-1]) / 2
+    np.testing.assert_allclose(on_axis(edges)[1:-1], middles)
+    low, high = axes.get_xlim()
+    assert low < masses[0] and masses[-1] < high
+
+
 def test_a_contour_is_where_the_level_is() -> None:
     columns = grid_columns()
     columns["reason"] = [""] * 6
@@ -133,6 +150,51 @@ def test_lines_are_in_the_order_of_x_and_apart_by_colour() -> None:
     np.testing.assert_allclose(first.get_xydata(), [[1, 1], [2, 4], [3, 9]])
     np.testing.assert_allclose(second.get_xydata(), [[1, 2], [2, np.nan], [3, 6]])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
+
+
+def test_errors_against_several_rows_at_one_place_are_refused() -> None:
+    """The last of them was the reference of all."""
+    columns = {
+        SPEED: [1.0, 1.0, 1.0, 1.0],
+        MASS: [0.5, 0.5, 2.0, 2.0],
+        "at_contact.model": ["full", "sdc", "full", "sdc"],
+        "impulse_Ns": [1.0, 1.1, 2.0, 2.1],
+        "reason": [""] * 4,
+    }
+    given = {"kind": "lines", "x": SPEED, "y": "impulse_Ns", "against": {"at_contact.model": "full"}}
+    with pytest.raises(InputError, match=r"several rows with .* have the same at_contact.speed_m_s"):
+        picture(columns, **given, colour="at_contact.model")
+    panels = picture(columns, **given, colour="at_contact.model", panel=MASS).axes
+    assert [axes.lines[0].get_ydata()[0] for axes in panels] == pytest.approx([10.0, 5.0])
+
+
+@pytest.mark.parametrize("kind", ["lines", "scatter"])
+@pytest.mark.parametrize("text", [True, False])
+def test_a_legend_of_many_is_on_the_page_and_its_colours_are_distinct(kind: str, text: bool) -> None:
+    """Its row ended at the page's edge, and every eighth line had the colour of the first."""
+    many = 30
+    of = np.repeat(np.arange(many) + 0.5, 2)
+    columns: dict[str, Any] = {
+        MASS: np.array([f"robot number {x:g}" for x in of], dtype=object) if text else of,
+        SPEED: np.tile([1.0, 2.0], many),
+        "impulse_Ns": of,
+        "reason": [""] * (2 * many),
+    }
+    drawn = picture(columns, kind=kind, x=SPEED, y="impulse_Ns", colour=MASS)
+    if kind == "scatter" and not text:
+        assert not drawn.legends  # it has a bar
+        return
+    drawn.draw_without_rendering()
+    (legend,) = drawn.legends
+    box = legend.get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= drawn.bbox.x1 and box.y0 >= 0
+    names = [entry.get_text() for entry in legend.get_texts()]
+    first, last = ("robot number 0.5", "robot number 29.5") if text else ("0.5", "29.5")
+    assert names[0] == first and names[-1] == last and (len(names) == many or not text)
+    axes = drawn.axes[0]
+    marks = axes.lines if kind == "lines" else axes.collections
+    colours = [tuple(np.ravel(m.get_color() if kind == "lines" else m.get_facecolor())) for m in marks]
+    assert len(set(colours)) == many
 
 
 def test_errors_are_against_the_row_with_the_same_rest() -> None:
@@ -198,6 +260,24 @@ def test_what_a_figure_names_has_to_be_there() -> None:
         sweep_from_data(collisions_data(kind="heat map"))
 
 
+@pytest.mark.parametrize(
+    ("figure", "says"),
+    [
+        ({"kind": "lines", "y": "impulse_Ns", "contour": {"impulse_Ns": 1.0}}, "contour: of kind = 'heatm"),
+        ({"panel": "target.mass"}, "panel: of kind = 'lines' or 'scatter' only, not 'heatmap'"),
+        ({"kind": "scatter", "against": {"target.mass": 1.0}}, "against: of kind = 'lines' only"),
+        ({"kind": "scatter", "y": ["impulse_Ns", "target.mass"]}, "y: several are of kind = 'lines' only"),
+        ({"kind": "scatter", "colour": ["impulse_Ns", "target.mass"]}, "colour: several are of"),
+        ({"contour": {"impulse_Ns": 1.0, "peak_force_N": 1.0, "target.mass": 1.0, "at_contact.speed": 1.0}},
+         "4 lines; give at most 3"),
+    ],
+)  # fmt: skip
+def test_what_a_figures_kind_does_not_draw_is_refused(figure: dict[str, Any], says: str) -> None:
+    """It was left out silently."""
+    with pytest.raises(InputError, match=rf"\[figure\] .*{says}"):
+        sweep_from_data(collisions_data(**figure))
+
+
 def test_what_a_figure_of_plans_names_has_to_be_there() -> None:
     """Told before a case is solved; columns of target, objectives and scenarios are known by prefixes."""
     names = ("target.mass", "impulse_Ns", "target_speed_m_s", "torque_ratio_swing", "heavy_slow_impulse_Ns")
@@ -242,6 +322,62 @@ def test_the_command_draws(tmp_path: Path) -> None:
     assert len(read_columns(table, ["impulse_Ns"])["impulse_Ns"]) == 6
     with pytest.raises(InputError, match="did you mean 'impulse_Ns'"):
         read_columns(table, ["impulse_N"])
+
+
+PRESS = """<robot name="press">
+<link name="base"/>
+<joint name="slide" type="prismatic"><parent link="base"/><child link="ram"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" effort="300" velocity="3"/></joint>
+<link name="ram"><inertial><mass value="3"/>
+<inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</robot>"""
+
+
+@pytest.mark.slow
+def test_a_prismatic_joint_has_metres(tmp_path: Path) -> None:
+    """In the table and the picture: moved by metres, with a servo in N s/m."""
+    (tmp_path / "press.urdf").write_text(PRESS, encoding="utf-8")
+    (tmp_path / "press.toml").write_text(
+        """
+        [problem]
+        striker = "ram"
+        point_m = [0.0, 0.0, 0.0]
+        normal = [1.0, 0.0, 0.0]
+        start = "zero"
+        [robot]
+        urdf = "press.urdf"
+        floating = false
+        kd_N_m_s_rad.slide = 100.0
+        [[robot.strikers]]
+        name = "ram"
+        frame = "ram"
+        point_m = [0.0, 0.0, 0.0]
+        [robot.postures_rad.zero]
+        slide = 0.0
+        [target]
+        mass_kg = 1.0
+        [contact]
+        stiffness_N_m = 1e4
+        damping_N_s_m = 100.0
+        """,
+        encoding="utf-8",
+    )
+    place, gain = "at_contact.joints_rad.slide", "robot.kd_N_m_s_rad.slide"
+    study = sweep_from_data(
+        {
+            "sweep": {"problem": str(tmp_path / "press.toml"), "case_kind": "collision"},
+            "at_contact": {"speed": 1.0},
+            "grid": {"at_contact.joints_rad.slide": [0.0, 0.1], "robot.kd.slide": [100.0, 200.0]},
+            "figure": {"kind": "lines", "x": place, "y": "impulse_Ns", "colour": gain},
+        }
+    )
+    table = sweep(study, tmp_path / "out", workers=1, progress=False).table
+    units = read_units(table)
+    assert (units[place], units[gain], units["impulse_Ns"]) == ("m", "N s/m", "N s")
+    assert study.figure is not None
+    drawn = drawn_table(study.figure, table)
+    assert drawn.axes[0].get_xlabel() == "slide moved by [m]"
+    assert drawn.legends[0].get_title().get_text() == "kd slide [N s/m]"
 
 
 @pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)

@@ -209,6 +209,17 @@ def test_a_worker_of_another_version_is_refused() -> None:
         evaluate(work, Unit(index=0, first=0, count=1, columns={}))
 
 
+@pytest.mark.slow
+def test_a_script_that_its_workers_run_again_is_told_what_helps(tmp_path: Path) -> None:
+    """A single worker of a sweep is a process too: to ask for one does not help."""
+    script = tmp_path / "script.py"
+    script.write_text(f"import impactopt\nimpactopt.sweep({SWEEP!r}, 'out', workers=1)\n", encoding="utf-8")
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    last = done.stderr.splitlines()[-1]
+    assert done.returncode == 1 and 'under `if __name__ == "__main__":`' in last
+    assert "workers=1" not in last
+
+
 # ---------------------------------------------------------------- the command
 def test_a_bad_sweep_file_is_exit_code_2(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["sweep", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out")])

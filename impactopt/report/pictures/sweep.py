@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from impactopt.report.pictures.sweep_columns import (
 )
 from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.sections import Figure as Section
-from impactopt.sweeps.table import read_columns
+from impactopt.sweeps.table import read_columns, read_units
 
 Array = NDArray[np.float64]
 
@@ -46,6 +46,8 @@ COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
 NO_RESULT = "#d9d9d9"  # colour of cases without a result
 MAX_MARKED = 25  # points of a line that are marked; longer lines have no marks
+MAX_LISTED = 8  # shades in a legend; of more, some are listed
+LEGEND_WIDTH, HANDLE_WIDTH = 120, 8  # characters of a row of the legend, and of the mark before a label
 MAX_POINTS = 20_000  # of a scatter plot: more are no clearer
 SCALE = "cividis"
 MODEL, FREEZES = "at_contact.model", "at_contact.freezes"
@@ -69,21 +71,22 @@ def save_sweep_picture(sweep: Sweep, table: Path) -> Path | None:
 
 def drawn_table(section: Section, table: Path) -> Picture:
     """Picture of a table's file, as `sweep_picture`."""
-    return sweep_picture(section, read_columns(table, (*section.columns, "reason")))
+    return sweep_picture(section, read_columns(table, (*section.columns, "reason")), read_units(table))
 
 
 @styled
-def sweep_picture(section: Section, columns: Columns) -> Picture:
+def sweep_picture(section: Section, columns: Columns, units: Mapping[str, str] | None = None) -> Picture:
     """Picture of a sweep's table.
 
-    columns : of the table by name: those that `section` names, and `reason`.
+    columns : of the table by name: those that `section` names, and `reason`.  units : of the columns; None:
+    those in their names.
 
     Raises
     ------
     InputError : a heatmap of cases that form no grid; columns that must be numbers and are not; no reference
         cases for errors.
     """
-    data = SweepColumns(section, columns)
+    data = SweepColumns(section, columns, units)
     if section.drawn_as == "heatmap":
         figure = _heatmap(section, data)
     elif section.drawn_as == "lines":
@@ -114,7 +117,8 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
         table[~np.isfinite(table)] = np.nan
         axes.set_facecolor(NO_RESULT)
         mesh = axes.pcolormesh(
-            across, up, np.ma.masked_invalid(table), shading="nearest", cmap=SCALE, rasterized=True,
+            _edges(across, "x" in section.log), _edges(up, "y" in section.log),
+            np.ma.masked_invalid(table), cmap=SCALE, rasterized=True,
             norm=LogNorm() if "colour" in section.log and (table > 0).any() else None,
         )  # fmt: skip
         axes.grid(visible=False)
@@ -128,7 +132,7 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
     panels[0].set_ylabel(data.label(section.y[0]))
     handles: list[Any] = []
     if data.reasons:
-        handles.append(Patch(facecolor=NO_RESULT, label=f"no collision: {data.note()}"))
+        handles.append(Patch(facecolor=NO_RESULT, label=f"no result: {data.note()}"))
     for dashes, (column, level) in zip(DASHES, section.contour.items(), strict=False):
         what, _, unit = data.label(column).partition(" [")
         label = f"{what} {level:g} {unit.rstrip(']')}".rstrip()
@@ -136,6 +140,16 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
     if handles:
         figure.legend(handles=handles, loc="outside lower left", ncols=min(len(handles), 2))
     return figure
+
+
+def _edges(values: Array, log: bool) -> Array:
+    """Edges (k + 1,) of cells around increasing values (k,), half-way between them on the axis."""
+    log = log and values[0] > 0
+    x = np.log(values) if log else values
+    # a single value has a cell too
+    step = np.diff(x) if len(x) > 1 else np.array([1.0 if log else abs(x[0]) or 1.0])
+    edges = np.concatenate([x - step[[0, *range(len(x) - 1)]] / 2, [x[-1] + step[-1] / 2]])
+    return np.exp(edges) if log else edges
 
 
 def _contour(
@@ -180,11 +194,24 @@ def _lines(section: Section, data: SweepColumns) -> Picture:
         grid[-1, k].set_xlabel(data.label(section.x))
     if len(legend) > 1:
         above = data.label(section.colour[0]) if len(section.colour) == 1 else None
-        handles = list(legend.values())
-        figure.legend(
-            handles, list(legend), loc="outside lower left", title=above, alignment="left", ncols=len(legend)
-        )
+        shown = list(legend.items())
+        if _shaded(section, data) and len(shown) > MAX_LISTED:
+            shown = [shown[round(k)] for k in np.linspace(0, len(shown) - 1, MAX_LISTED)]
+        _legend(figure, [line for _, line in shown], [name for name, _ in shown], above)
     return figure
+
+
+def _legend(figure: Picture, handles: Sequence[Any], labels: Sequence[str], title: str | None) -> None:
+    """Legend below the panels, in as many rows as its labels need."""
+    widths = [len(label) + HANDLE_WIDTH for label in labels]
+    room = LEGEND_WIDTH * figure.get_figwidth() / PAGE
+    columns = len(labels) if sum(widths) <= room else max(int(room / max(widths)), 1)
+    figure.legend(handles, labels, loc="outside lower left", title=title, alignment="left", ncols=columns)
+
+
+def _shaded(section: Section, data: SweepColumns) -> bool:
+    """True if lines have the shades of one number."""
+    return len(section.colour) == 1 and data.values(section.colour[0]).dtype != object
 
 
 def _shades(
@@ -195,10 +222,12 @@ def _shades(
         again = data.numbers(FREEZES) if FREEZES in section.colour else np.zeros(len(groups))
         first = [int(np.argmax(groups == g)) for g in range(len(names))]
         return [model_colour(data.values(MODEL)[k], again[k]) for k in first]
-    one = len(section.colour) == 1 and data.values(section.colour[0]).dtype != object
-    if one and len(names) > 2:
-        return [colormaps[SCALE](0.9 * k / (len(names) - 1)) for k in range(len(names))]
-    return [COLOURS[k % len(COLOURS)] for k in range(len(names))]
+    return _colours(len(names), 2 if _shaded(section, data) else len(COLOURS))
+
+
+def _colours(count: int, most: int = len(COLOURS)) -> list[Any]:
+    """Distinct colours; shades of one scale, if they are more than `most`."""
+    return [colormaps[SCALE](0.9 * k / (count - 1)) if count > most else COLOURS[k] for k in range(count)]
 
 
 # ---------------------------------------------------------------- scatter
@@ -226,7 +255,7 @@ def _scatter(section: Section, data: SweepColumns) -> Picture:
         own = drawn[panel[drawn] == k]
         for g, series in enumerate(names):
             some = own[groups[own] == g]
-            paint: dict[str, Any] = {"color": COLOURS[g % len(COLOURS)], "label": series}
+            paint: dict[str, Any] = {"color": _colours(len(names))[g], "label": series}
             if numeric and colour is not None:
                 paint = {"c": data.numbers(colour)[some], "cmap": SCALE, "norm": norm}
             marks = axes.scatter(x[some], y[some], s=size, edgecolors="none", rasterized=True, **paint)
@@ -239,7 +268,7 @@ def _scatter(section: Section, data: SweepColumns) -> Picture:
         bar.outline.set_visible(False)
     elif len(names) > 1 and colour is not None:
         handles, labels = grid[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower left", title=data.label(colour), ncols=len(labels))
+        _legend(figure, handles, labels, data.label(colour))
     if shown.sum() > len(drawn):
         figure.supxlabel(f"{len(drawn):,} of {shown.sum():,} rows", fontsize=7, x=0.01, ha="left")
     return figure

@@ -21,11 +21,13 @@ Columns = Mapping[str, Sequence[Any] | NDArray[Any]]
 class SweepColumns:
     """Columns of a sweep's table, as numbers or as text.
 
-    good : mask of the cases with a result.  reasons : counts of the reasons why others have none.
+    good : mask of the cases with a result.  reasons : counts of the reasons why others have none.  units :
+    of the columns; None: those in their names.
     """
 
-    def __init__(self, section: Section, columns: Columns) -> None:
+    def __init__(self, section: Section, columns: Columns, units: Mapping[str, str] | None = None) -> None:
         self.section, self._columns = section, columns
+        self._units = {name: unit_of(name) for name in columns} if units is None else units
         reasons = columns.get("reason", ())
         self.reasons = Counter(str(r) for r in reasons if r)
         self.good = np.array([not r for r in reasons], dtype=bool) if len(reasons) else None
@@ -58,20 +60,20 @@ class SweepColumns:
 
     def label(self, name: str) -> str:
         """Label of a column, with its unit."""
-        return self.section.labels.get(name, _label(name))
+        return self.section.labels.get(name, _label(name, self._units.get(name, "")))
 
     def note(self) -> str:
         """The two most frequent reasons why cases have no result."""
         return "; ".join(reason.partition(";")[0] for reason, _ in self.reasons.most_common(2))
 
 
-def _label(name: str) -> str:
+def _label(name: str, unit: str) -> str:
     """Label of a column, such as "target mass [kg]" of `target.mass_kg`."""
-    unit, parts = unit_of(name), without_unit(name).split(".")
+    parts = without_unit(name).split(".")
     if parts[0] == "at_contact":
         parts = parts[1:]
         if parts[0] == "joints":
-            return f"{joint_label(parts[1])} moved by [rad]"
+            return f"{joint_label(parts[1])} moved by [{unit}]"
         parts = ["speed at contact"] if parts == ["speed"] else parts
     elif parts[0] in ("problem", "robot"):
         parts = parts[1:]
@@ -96,7 +98,14 @@ def errors_against(section: Section, data: SweepColumns, values: Array) -> Array
         raise InputError(f"[figure] against: no row has {section.against}")
     shared = [section.x, *([section.panel] if section.panel else [])]
     points = list(zip(*[data.values(name).tolist() for name in shared], strict=True))
-    reference = {points[i]: values[i] for i in np.flatnonzero(base)}
+    reference: dict[tuple[Any, ...], float] = {}
+    for i in np.flatnonzero(base & np.isfinite(values)):
+        if reference.setdefault(points[i], values[i]) != values[i]:
+            raise InputError(
+                f"[figure] against: several rows with {section.against} have the same "
+                f"{' and '.join(shared)}, and other results; take the key in which they differ as the panel, "
+                "or give it one value"
+            )
     true = np.array([reference.get(point, np.nan) for point in points])
     error = np.where(base, np.nan, 100 * (values / true - 1))
     return np.abs(error) if "y" in section.log else error

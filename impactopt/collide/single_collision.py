@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import ceil
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from impactopt.collide.contact_states import ContactStates, States
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.sdc import frozen_model
+from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact.friction import tangential_outcome
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_choice
@@ -137,6 +139,31 @@ def collision_model(
     return frozen_model(section.model, section.freezes, accuracy=accuracy, **options)
 
 
+# instants that histories have of a contact at least: with fewer they miss its peak by more than 1 %
+_INSTANTS = 10
+
+
+def finer(model: CollisionModel, durations: Array) -> Iterator[tuple[CollisionModel, NDArray[np.intp]]]:
+    """Models with `_INSTANTS` in contacts of these durations (N) [s], each with the indices of its contacts.
+
+    There are none for contacts in which the model itself has so many.
+    """
+    if not isinstance(model, SymbolicModel) or model.stepping != "implicit":
+        return  # full dynamics have more, Runge-Kutta's steps resolve the contact, an impact takes no time
+    # powers of ten, as compiled functions depend on the step
+    with np.errstate(divide="ignore", invalid="ignore"):
+        powers = np.floor(np.log10(durations / _INSTANTS))
+    for power in np.unique(powers[np.isfinite(powers)]):
+        if 10.0**power < model.step_length:
+            yield _with_step(model, 10.0**power), np.flatnonzero(powers == power)
+
+
+@lru_cache(maxsize=32)  # a model holds its loaded functions
+def _with_step(model: SymbolicModel, step: float) -> SymbolicModel:
+    # `finer`'s contacts last less than a hundred steps; histories have as many columns as a horizon has steps
+    return replace(model, step=step, horizon=min(model.horizon, 200 * step))
+
+
 LEAST_LOAD = 1e-3  # vertical force on the ground over the weight; with less the ZMP is undefined
 
 
@@ -174,13 +201,23 @@ def _velocity_ratio(batch: CollisionResults) -> Array:
     return np.asarray((joints / batch.robot.velocity_limit).max(axis=1))
 
 
+def zmp_margins(robot: Robot, polygon: Array, ground: Array) -> Array:
+    """Distances (k) [m] of the ZMP from the edges of a support polygon, positive inside.
+
+    Minus infinity where the ground carries no load, or would have to pull.
+
+    polygon (c, 2) [m].  ground (k, 6) : wrenches as of `Collision`.
+    """
+    out = np.full(len(ground), -np.inf)
+    stands = ground[:, 2] > LEAST_LOAD * weight_of(robot)
+    out[stands] = margin(polygon, zmp(ground[stands]))
+    return out
+
+
 def _zmp_margin(batch: CollisionResults) -> Array:
     ground = batch.found["ground_wrench"]
-    flat = ground.reshape(-1, 6)
-    out = np.full(len(flat), -np.inf)
-    stands = flat[:, 2] > LEAST_LOAD * weight_of(batch.robot)
-    out[stands] = margin(batch.polygon, zmp(flat[stands]))
-    return out.reshape(ground.shape[:2]).min(axis=1)
+    inside = zmp_margins(batch.robot, batch.polygon, ground.reshape(-1, 6))
+    return np.asarray(inside.reshape(ground.shape[:2]).min(axis=1))
 
 
 MEASURES: Mapping[str, Measure] = {
@@ -196,18 +233,20 @@ MEASURES: Mapping[str, Measure] = {
     "energy_J": Measure(outputs=("energy",), what="given to the target", of=lambda b: b.found["energy"]),
     "torque_ratio": Measure(
         outputs=("demand",),
-        what="largest torque demand over its joint's limit, at every millisecond of contact",
+        what="largest torque demand over its joint's limit, at every millisecond of contact and ten "
+        "times at least",
         of=_torque_ratio,
     ),
     "zmp_margin_m": Measure(
         outputs=("ground_wrench",),
         what="least distance of the ZMP from the soles' hull, positive inside, at every millisecond of "
-        "contact; minus infinity where they carry no load, or would have to pull",
+        "contact and ten times at least; minus infinity where they carry no load, or would have to pull",
         of=_zmp_margin,
     ),
     "sole_force_N": Measure(
         outputs=("sole_wrench",),
-        what="least vertical force of the ground on one sole, at every millisecond of contact",
+        what="least vertical force of the ground on one sole, at every millisecond of contact and ten times "
+        "at least",
         of=lambda b: b.found["sole_wrench"][..., 2].min(axis=(1, 2)),
     ),
     "freeze_error_pct": Measure(
@@ -363,6 +402,8 @@ def collide_once(
     if state.reason[0]:
         return {**head, "reason": str(state.reason[0])}
     collision = _collide(model, state, section)
+    for resolving, _ in finer(model, np.array([collision.duration])):
+        collision = _collide(resolving, state, section)
     if not collision.separated:
         misplaced = record is not None and section.model == "sdc"
         return {**head, "reason": _CONTACT_DOES_NOT_END if misplaced else NOT_ENDED}

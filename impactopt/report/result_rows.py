@@ -146,8 +146,10 @@ def phase_rows(sources: Sequence[Mapping[str, Any]], phases: Iterable[str]) -> I
 
 def collision_rows(found: Mapping[str, Any]) -> list[Row]:
     """Rows of one collision and those of a saved result; `found` as in `impactopt collide --json`."""
-    sources = [found, *(found.get("saved") or {}).values()]
+    sources = [dict(x) for x in (found, *(found.get("saved") or {}).values())]
     most_uncertain = -np.inf if found.get("caution") else np.inf
+    # null: at some instant the ground carries no load, or would have to pull
+    sources = [x | {"zmp_margin_m": -np.inf} if x.get("zmp_margin_m", 0) is None else x for x in sources]
     rows = [
         number_row(label, [x.get(key) for x in sources], digits, scale=scale, least=least, most=most)
         for label, key, digits, scale, least, most in (

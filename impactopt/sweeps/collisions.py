@@ -25,6 +25,7 @@ from impactopt.collide.single_collision import (
     check_at_contact,
     chosen,
     collision_model,
+    finer,
     full_names,
     servo_settings,
 )
@@ -220,13 +221,34 @@ class CollisionBatch:
         states = states.some(good)
         settings = {name: x[good] if len(x) == count else x for name, x in settings.items()}
         settings |= states.reference_settings
+        values, durations = self._measured(model, states, settings, posture, threads)
+        if {*self._outputs} & {*HISTORIES}:
+            for resolving, some in finer(model, durations):
+                theirs = {name: x[some] if len(x) == len(good) else x for name, x in settings.items()}
+                better, _ = self._measured(resolving, states.some(some), theirs, posture, threads)
+                for name, x in better.items():
+                    values[name][some] = x
+        for name, x in values.items():
+            out[name][good] = x
+        return out
+
+    def _measured(
+        self,
+        model: CollisionModel,
+        states: States,
+        settings: Mapping[str, Array],
+        posture: Posture,
+        threads: int | None,
+    ) -> tuple[dict[str, NDArray[Any]], Array]:
+        """Values (count,) as of `__call__` for states at contact, and durations (count,) [s] of contacts."""
         # a point mass has no servo, and the paper's SDC no stiffness
         known = getattr(model, "settings", settings)
         given = {name: x for name, x in settings.items() if name in known}
+        outputs = tuple(dict.fromkeys((*self._outputs, "duration")))
         if isinstance(model, SymbolicModel):
-            found, reason = batch(model, self._outputs, states, given, threads)
+            found, reason = batch(model, outputs, states, given, threads)
         else:
-            found, reason = one_by_one(model, self._outputs, states, given)
+            found, reason = one_by_one(model, outputs, states, given)
         collisions = CollisionResults(
             found=found,
             states=states,
@@ -234,10 +256,11 @@ class CollisionBatch:
             torque_limit=settings["torque_limit"],
             polygon=posture.polygon,
         )
-        for name, measure in self.measures.items():
-            out[name][good] = np.where(reason == "", measure.of(collisions), np.nan)
-        out["reason"][good] = reason
-        return out
+        values: dict[str, NDArray[Any]] = {
+            name: np.where(reason == "", measure.of(collisions), np.nan)
+            for name, measure in self.measures.items()
+        }
+        return {**values, "reason": reason}, found["duration"]
 
     def _settings(self, numbers: Numbers) -> dict[str, Array]:
         """Parameters of law, target and servo by their names in `Settings`, (count, ...) or (1, ...)."""

@@ -34,6 +34,7 @@ from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin
+from impactopt.report.result_rows import collision_rows
 from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.collisions import Collisions
 
@@ -140,6 +141,30 @@ def test_of_a_robot_on_soles_with_its_margins() -> None:
         assert found["zmp_margin_m"][i] == pytest.approx(margin(polygon.polygon, one.zmp).min(), rel=1e-7)
         assert found["sole_force_N"][i] == pytest.approx(one.sole_wrench[..., 2].min(), rel=1e-7)
         assert found["torque_ratio"][i] == pytest.approx(np.abs(one.demand / limit).max(), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_loads_of_the_ground_in_a_contact_of_less_than_a_millisecond() -> None:
+    """They are largest in the middle of the contact, as full dynamics have them."""
+    outputs = ("zmp_margin_m", "sole_force_N", "torque_ratio")
+    columns = {"contact.stiffness": [1e4, 1e6, 1e8, 1e8], "at_contact.speed": [0.5, 0.5, 0.25, 0.5]}
+    given = {"posture": "half_sitting"}
+    found = collide_many(standin_file(), columns, outputs=outputs, at_contact=given)
+    full = collide_many(standin_file(), columns, outputs=outputs, at_contact={**given, "model": "full"})
+    assert full["sole_force_N"][2] < 0 < full["sole_force_N"][1] and full["zmp_margin_m"][3] == -np.inf
+    for name in outputs:
+        assert found[name] == pytest.approx(full[name], rel=0.01, abs=1e-3 if name == "zmp_margin_m" else 2.0)
+    section = {**standin_file().data["contact"], "stiffness_N_m": 1e8}
+    stiff = problem_file_from_data({**standin_file().data, "contact": section}, where="stiff.toml")
+    once = collide_once(stiff, {**given, "speed_m_s": 0.5})
+    assert once["sole_force_N"] == pytest.approx(found["sole_force_N"][3], rel=1e-6)
+    assert once["zmp_margin_m"] is None
+
+
+def test_a_ground_without_load_is_in_the_table() -> None:
+    rows = {row.label: row.cells[0] for row in collision_rows({"zmp_margin_m": None, "sole_force_N": -10.0})}
+    assert rows["ZMP margin [mm]"].text == "-inf" and not rows["ZMP margin [mm]"].good
+    assert "ZMP margin [mm]" not in {row.label for row in collision_rows({"impulse_Ns": 1.0})}
 
 
 def test_structure_may_differ_from_row_to_row() -> None:

@@ -389,6 +389,8 @@ def test_the_state_of_a_result(tmp_path: Path) -> None:
         arm_file(), {}, at_contact={"result": str(tmp_path)}, outputs=("impulse_Ns", "hand_speed_m_s")
     )
     assert as_saved["impulse_Ns"][0] == pytest.approx(model.collide(q, v, torque).impulse, rel=1e-9)
+    short = {"result": str(tmp_path), "freezes": 2, "horizon_s": 1e-3}
+    assert "raise it: at_contact.horizon_s" in collide_once(arm_file(), short)["reason"]
     twice = {"at_contact.speed": [2 * as_saved["hand_speed_m_s"][0]]}
     faster = collide_many(arm_file(), twice, at_contact={"result": str(tmp_path)})
     other = torque + holding_torque(robot, q, 2 * v) - holding_torque(robot, q, v)

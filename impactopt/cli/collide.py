@@ -36,8 +36,8 @@ def collide(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="A posture of the robot by name, on soles as it has them, without steps of [[stances]]; left "
-            "out: a reach to the problem's point.",
+            help="A posture of the robot by name, on soles as it has them, without steps of [[stances]]; "
+            "left out: a reach to the problem's point.",
         ),
     ] = None,
     model: Annotated[Model, typer.Option(help="Model of the collision.")] = "sdc",

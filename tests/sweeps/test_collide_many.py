@@ -34,7 +34,7 @@ from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin
-from impactopt.report.result_rows import collision_rows
+from impactopt.report.result_rows import collision_rows, contact_rows
 from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.collisions import Collisions
 
@@ -165,6 +165,17 @@ def test_a_ground_without_load_is_in_the_table() -> None:
     rows = {row.label: row.cells[0] for row in collision_rows({"zmp_margin_m": None, "sole_force_N": -10.0})}
     assert rows["ZMP margin [mm]"].text == "-inf" and not rows["ZMP margin [mm]"].good
     assert "ZMP margin [mm]" not in {row.label for row in collision_rows({"impulse_Ns": 1.0})}
+
+
+def test_the_table_has_two_digits_of_a_target_of_grams() -> None:
+    """A gram that 0.5 m/s hit: rounded to a thousandth, its impulse was off by a third."""
+    found = {"impulse_Ns": 7.46e-4, "energy_J": 2.79e-4, "peak_force_N": 0.0, "target": {"speed_m_s": 0.746}}
+    rows = {row.label: row.cells[0].text for row in collision_rows(found)}
+    assert float(rows["impulse [N s]"]) == pytest.approx(7.46e-4, rel=0.05)
+    assert float(rows["energy to the target [J]"]) == pytest.approx(2.79e-4, rel=0.05)
+    assert (rows["peak force [N]"], rows["speed of the target [m/s]"]) == ("0.0", "0.746")
+    (planned,) = (row for row in contact_rows([found]) if row is not None and row.label == "impulse [N s]")
+    assert planned.cells[0].text == "0.00075"
 
 
 def test_structure_may_differ_from_row_to_row() -> None:

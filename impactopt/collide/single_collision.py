@@ -48,11 +48,11 @@ class AtContact(Section):
 
     The state at contact is that of `result`, a directory of `impactopt solve` or `strike`; or of `posture`:
     "reach" for the problem's start posture with the striking point moved to the problem's point, or a
-    posture of the robot by name, with its soles and the target at its hand, whatever steps [[stances]] has.
-    `joints` are added to it. The striking point
-    moves along the normal at `speed`: a result's velocity is scaled; a posture gets the `velocity` of least
-    kinetic energy, or that of the least sum of squares of joint velocities over their limits. The
-    feed-forward torque keeps the joint velocities. Scales multiply the robot's gains and torque limits.
+    posture of the robot by name, with the target at its hand, and its soles where it has them, whatever steps
+    [[stances]] has. `joints` are added to it. The striking point moves along the normal at `speed`: a
+    result's velocity is scaled; a posture gets the `velocity` of least kinetic energy, or that of the least
+    sum of squares of joint velocities over their limits. The feed-forward torque keeps the joint velocities.
+    Scales multiply the robot's gains and torque limits.
     """
 
     posture: str = "reach"

@@ -270,6 +270,11 @@ MEASURES: Mapping[str, Measure] = {
 }
 
 
+def weightless(model: CollisionModel) -> bool:
+    """True if forces on single soles lack the weight, as in a model without bias forces."""
+    return isinstance(model, SymbolicModel) and not model.effects.bias
+
+
 def chosen(names: Iterable[str], target: Target) -> dict[str, Measure]:
     """Measures by name, among them the target's results: target_speed_m_s, target_depth_m, target_broken.
 
@@ -422,6 +427,8 @@ def collide_once(
         polygon=posture.polygon,
     )
     available = {name: m for name, m in MEASURES.items() if all(found[o] is not None for o in m.outputs)}
+    if weightless(model):
+        available.pop("sole_force_N", None)
     numbers = {name: float(measure.of(batch)[0]) for name, measure in available.items()}
     target = model.target.with_units(collision.target_result.values())
     if collision.tangential_velocity is not None:

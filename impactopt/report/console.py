@@ -183,6 +183,8 @@ def collision_table(found: Mapping[str, Any]) -> Table:
     table = _empty(f"{found['problem']}: {model}", "", "collision", *(found.get("saved") or {}))
     notes = [f"caution: {found['caution']}"] if found.get("caution") else []
     notes += [f"{found['model']}: {found['believe']}"] if "believe" in found else []
+    if found["model"] == "sdc-paper" and "believe" not in found:
+        notes.append("torque demands without those that carry the weight: this model has no feed-forward")
     notes += ["no peak force: the impact takes no time"] if found["model"] == "rigid" else []
     if notes:
         table.caption, table.caption_justify = _plain("\n".join(notes)), "left"

@@ -28,6 +28,7 @@ from impactopt.collide.single_collision import (
     finer,
     full_names,
     servo_settings,
+    weightless,
 )
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.checks import FREEZE_ERROR, too_large
@@ -511,6 +512,11 @@ class Collisions:
                 model._check_outputs(tuple(needed), 1)
             elif isinstance(model, RigidImpact) and (unknown := [x for x in needed if x in OF_SERVO]):
                 raise InputError(f"output {unknown[0]!r}: a rigid impact knows nothing of it; leave it out")
+            if "sole_force_N" in measures and weightless(model):
+                raise InputError(
+                    f"output 'sole_force_N': the model {section.model!r} has no gravity, so that forces on "
+                    "single soles lack the weight; leave it out, or take 'sdc' or 'full'"
+                )
             self._batches[key] = CollisionBatch(
                 file=file, section=section, model=model, states=states, measures=measures
             )

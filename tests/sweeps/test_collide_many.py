@@ -34,6 +34,7 @@ from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin
+from impactopt.report.console import collision_table
 from impactopt.report.result_rows import collision_rows, contact_rows
 from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.collisions import Collisions
@@ -165,6 +166,16 @@ def test_a_ground_without_load_is_in_the_table() -> None:
     rows = {row.label: row.cells[0] for row in collision_rows({"zmp_margin_m": None, "sole_force_N": -10.0})}
     assert rows["ZMP margin [mm]"].text == "-inf" and not rows["ZMP margin [mm]"].good
     assert "ZMP margin [mm]" not in {row.label for row in collision_rows({"impulse_Ns": 1.0})}
+
+
+@pytest.mark.slow
+def test_a_model_without_gravity_has_no_forces_on_single_soles() -> None:
+    """The soles carry the weight however slow the hit is; the paper's model told of forces about zero."""
+    given = {"posture": "half_sitting", "speed_m_s": 1e-3}
+    paper = collide_once(standin_file(), {**given, "model": "sdc-paper"})
+    assert "sole_force_N" not in paper and "zmp_margin_m" in paper
+    assert "without those that carry the weight" in str(collision_table(paper).caption)
+    assert collide_once(standin_file(), given)["sole_force_N"] > 100.0
 
 
 def test_the_table_has_two_digits_of_a_target_of_grams() -> None:
@@ -492,6 +503,9 @@ def test_mistakes_in_what_is_asked_for() -> None:
         with pytest.raises(InputError, match=f"output 'demand': {what} knows nothing of it"):
             given = {"speed_m_s": 1.0, "model": model}
             collide_many(arm_file(), {}, outputs=("torque_ratio",), at_contact=given)
+    with pytest.raises(InputError, match="forces on single soles lack the weight"):
+        given = {"speed_m_s": 1.0, "model": "sdc-paper"}
+        collide_many(standin_file(), {}, outputs=("sole_force_N",), at_contact=given)
     with pytest.raises(InputError, match="which is held"):
         given = {"speed_m_s": 1.0, "joints_rad": {standin_leg(): 0.1}}
         collide_many(standin_file(), {}, at_contact=given)

@@ -377,7 +377,8 @@ def collide_once(
 
     Returns the measures of docs/sweeps.md; ``target``, its results after the collision; ``joints``, the
     largest torque demand [N m] and the limit of each, by decreasing ratio; and ``caution`` if the estimated
-    error of freezing is too large. If the collision is impossible there is only ``reason``.
+    error of freezing is too large; and ``again`` if the target is touched again, which no measure has. If the
+    collision is impossible there is only ``reason``.
     For a saved result with unchanged contact also ``saved`` (`planned_numbers`), and ``believe``, which of
     its numbers and the model's to trust if they differ.
 
@@ -435,7 +436,28 @@ def collide_once(
         target |= tangential_outcome(collision.tangential_velocity)
     found = {**head, **numbers, "target": target, "joints": _joints(collision, robot, limit)}
     found |= {"caution": collision.caution} if collision.caution else {}
+    again = meets_again(model.target, collision)
+    found |= {"again": again} if again else {}
     return plain(found | ({} if record is None else _saved(file, section, record)))
+
+
+_STILL_APPROACHES = 0.05  # speed after a touch over the speed of approach; less is a push of the servo
+
+
+def meets_again(target: Target, collision: Collision) -> str:
+    """Caution about a nail or a board that the striker, still on its way, touches again; "" if it does not.
+
+    They slow down after the touch, which ends as soon as they are ahead of the striker.
+    """
+    if not target.met_again or collision.target_result.get("broken"):
+        return ""
+    before, *_, after = collision.hand_speed - float(target.speed_before())
+    if not after > _STILL_APPROACHES * before:
+        return ""
+    return (
+        f"the striker goes on at {collision.hand_speed[-1]:.3g} m/s and touches the {target.word} again: "
+        "this is the first touch alone, and the replays of a plan (impactopt solve) have all of them"
+    )
 
 
 def _horizon(record: Record, default: float) -> float:

@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.collide.contact_states import NOT_APPROACHING
-from impactopt.collide.single_collision import finer, zmp_margins
+from impactopt.collide.single_collision import finer, meets_again, zmp_margins
 from impactopt.collision import SDC, Collision
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
@@ -186,6 +186,8 @@ class CollisionPage(LivePage):
             return f"**No collision.** {shown.why}"
         lines = [f"**{collision.impulse:.3g} N s**" + (f" ({shown.why})" if shown.why else "")]
         lines.append(f"- {collision.peak_force:.0f} N at most, for {1e3 * collision.duration:.1f} ms")
+        if again := meets_again(self.problem.target, collision):
+            lines.append(f"- {again}")
         if collision.zmp is not None and len(self._polygon):
             inside = float(self._margins(collision).min())
             lines.append(

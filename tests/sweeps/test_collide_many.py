@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.integrate import solve_ivp
 from support.fake_solution import strike_record
 from support.small_robots import arm, biped
 
@@ -176,6 +177,32 @@ def test_a_model_without_gravity_has_no_forces_on_single_soles() -> None:
     assert "sole_force_N" not in paper and "zmp_margin_m" in paper
     assert "without those that carry the weight" in str(collision_table(paper).caption)
     assert collide_once(standin_file(), given)["sole_force_N"] > 100.0
+
+
+@pytest.mark.parametrize(("stiffness", "again"), [(1e5, False), (1e7, True)])
+def test_a_nail_that_is_touched_again_is_told(stiffness: float, again: bool) -> None:
+    """Two point masses and the wood by SciPy: a nail that jumps ahead is driven on by later touches."""
+    nail = {"kind": "nail", "mass_kg": 0.05, "resistance_N": 600.0}
+    contact = {"law": "Kelvin-Voigt", "stiffness_N_m": stiffness, "damping_N_s_m": 20.0}
+    data = {**arm_file().data, "target": nail, "contact": contact}
+    given = {"posture": "ready", "speed_m_s": 3.0, "model": "virtual-mass"}
+    found = collide_once(problem_file_from_data(data, where="nail.toml"), given)
+
+    def motion(_: float, y: Any) -> list[float]:
+        hand, at, speed, moves = y
+        touches = hand > at
+        force = max(stiffness * (hand - at) + 20.0 * (speed - moves), 0.0) if touches else 0.0
+        push = force - 600.0
+        driven = push / 0.05 if moves > 0 or push > 0 else 0.0
+        return [speed, max(moves, 0.0), -force / found["effective_mass_kg"], driven]
+
+    later = solve_ivp(motion, (0.0, 0.02), [0.0, 0.0, 3.0, 0.0], method="LSODA", rtol=1e-7, max_step=1e-5)
+    driven, first = float(later.y[1, -1]), found["target"]["depth_m"]
+    assert ("again" in found) == again and ("again: " in str(collision_table(found).caption)) == again
+    if again:
+        assert driven > 2 * first
+    else:
+        assert driven == pytest.approx(first, rel=0.01)
 
 
 def test_the_table_has_two_digits_of_a_target_of_grams() -> None:

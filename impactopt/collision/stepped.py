@@ -160,7 +160,8 @@ class SteppedModel(CollisionModel):
         exact to 1e-2 of the impulse (of a plastic impact's, if contact ends early). `collide` refuses steps
         whose estimated error is larger.
     step : [s]. With "rk4" the length of its steps, below `stable_step(q)`; None: the paper's 1e-4. With
-        "implicit", which chooses its own steps, the spacing of histories; None: 1e-3.
+        "implicit", which chooses its own steps, the spacing of histories; None: 1e-3. Of shorter contacts
+        histories have the ends alone, where there is no force: give a tenth of the contact's duration.
     tolerance : with "implicit", the permitted error of one step: in the hand's speed and in the impulse,
         relative to their changes, and in the target's switching functions, relative to their terms. The
         impulse is mostly as exact as that. Errors add up in long contacts in which a servo oscillates

@@ -36,7 +36,7 @@ def collide(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="A posture of the robot by name, on soles as it has them, without steps of [[stances]]; "
+            help="A posture of the robot by name, on soles as it has them, whatever steps the stances have; "
             "left out: a reach to the problem's point.",
         ),
     ] = None,

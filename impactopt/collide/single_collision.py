@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
@@ -27,7 +28,7 @@ from impactopt.files.sections.diagnostics import mistakes_of, report_mistakes
 from impactopt.files.sections.reading import CollisionFile
 from impactopt.files.sections.values import Positive, Section
 from impactopt.files.toml import read_toml
-from impactopt.kinematics.stance import Stance
+from impactopt.kinematics.stance import Free, Stance
 from impactopt.kinematics.support import margin, zmp
 from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot
@@ -377,8 +378,9 @@ def collide_once(
 
     Returns the measures of docs/sweeps.md; ``target``, its results after the collision; ``joints``, the
     largest torque demand [N m] and the limit of each, by decreasing ratio; and ``caution`` if the estimated
-    error of freezing is too large; and ``again`` if the target is touched again, which no measure has. If the
-    collision is impossible there is only ``reason``.
+    error of freezing is too large, ``again`` if the target is touched again, which no measure has, and
+    ``drifts`` if a robot that floats freely has momentum. If the collision is impossible there is only
+    ``reason``.
     For a saved result with unchanged contact also ``saved`` (`planned_numbers`), and ``believe``, which of
     its numbers and the model's to trust if they differ.
 
@@ -438,6 +440,8 @@ def collide_once(
     found |= {"caution": collision.caution} if collision.caution else {}
     again = meets_again(model.target, collision)
     found |= {"again": again} if again else {}
+    if record is None and (drifts := _drifts(robot, stance, state.q[0], state.v[0])):
+        found |= {"drifts": drifts}
     return plain(found | ({} if record is None else _saved(file, section, record)))
 
 
@@ -457,6 +461,18 @@ def meets_again(target: Target, collision: Collision) -> str:
     return (
         f"the striker goes on at {collision.hand_speed[-1]:.3g} m/s and touches the {target.word} again: "
         "this is the first touch alone, and the replays of a plan (impactopt solve) have all of them"
+    )
+
+
+def _drifts(robot: Robot, stance: Stance, q: Array, v: Array) -> str:
+    """Caution about momentum of a robot that floats without gravity at q (nq,), v (nv,); "" on a stance."""
+    if not isinstance(stance, Free) or robot.model.gravity.linear.any():
+        return ""
+    momentum = pin.computeCentroidalMomentum(robot.model, robot.model.createData(), q, v)
+    return (
+        f"the floating robot has a momentum of {np.linalg.norm(momentum.linear):.3g} N s and "
+        f"{np.linalg.norm(momentum.angular):.3g} N m s at contact: one that begins at rest has none, and needs "
+        "faster joints; take a result of impactopt solve"
     )
 
 

@@ -33,6 +33,8 @@ from impactopt.collide.contact_states import ContactStates, Posture
 from impactopt.collide.single_collision import collide_once
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.files.sections.reading import CollisionFile
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin
 from impactopt.report.console import collision_table
@@ -203,6 +205,28 @@ def test_a_nail_that_is_touched_again_is_told(stiffness: float, again: bool) -> 
         assert driven > 2 * first
     else:
         assert driven == pytest.approx(first, rel=0.01)
+
+
+def test_a_floating_robot_that_has_momentum_is_told() -> None:
+    """Without it, as from rest, the joints are faster."""
+    problem = Path(__file__).resolve().parents[2] / "problems" / "space_arm.toml"
+    file, given = CollisionFile.read(problem), {"posture": "ready", "speed_m_s": 0.5}
+    found = collide_once(file, {**given, "model": "rigid"})
+    robot, normal = space_arm(), np.array(file.content.problem.normal)
+    q = robot.posture("ready")
+    v = striking_velocity(robot, q, file.content.problem.striker, normal, 0.5, stance=Free())
+    body = ConstrainedDynamics.at(robot.model, q, (), robot.striker(file.content.problem.striker).model_frame)
+    inertia = body.inertia
+    assert found["drifts"].startswith(
+        f"the floating robot has a momentum of {np.linalg.norm((inertia @ v)[:3]):.3g} N s"
+    )
+    assert "drifts" not in collide_once(standin_file(), {"speed_m_s": 0.3, "model": "rigid"})
+    # of least energy among those with the base's generalized momentum zero
+    rows = np.vstack([inertia[:6], body.hand])
+    needed = np.concatenate([np.zeros(6), 0.5 * normal])
+    responses = np.linalg.solve(inertia, rows.T)
+    from_rest = responses @ np.linalg.solve(rows @ responses, needed)
+    assert np.abs(from_rest[6:] / robot.velocity_limit).max() > 2 * found["velocity_ratio"]
 
 
 def test_the_table_has_two_digits_of_a_target_of_grams() -> None:

@@ -471,8 +471,8 @@ def _drifts(robot: Robot, stance: Stance, q: Array, v: Array) -> str:
     momentum = pin.computeCentroidalMomentum(robot.model, robot.model.createData(), q, v)
     return (
         f"the floating robot has a momentum of {np.linalg.norm(momentum.linear):.3g} N s and "
-        f"{np.linalg.norm(momentum.angular):.3g} N m s at contact: one that begins at rest has none, and needs "
-        "faster joints; take a result of impactopt solve"
+        f"{np.linalg.norm(momentum.angular):.3g} N m s at contact: one that begins at rest has none, and "
+        "needs faster joints; take a result of impactopt solve"
     )
 
 

@@ -130,7 +130,10 @@ NO_NUMBER = (
     "the collision has no finite numbers: its steps are unstable here, or the constraints that fix the robot "
     "are linearly dependent"
 )
-TOO_STIFF = "the contact is too stiff for the steps of its law: {:.1g} of the impulse would be left out"
+TOO_STIFF = (
+    "the contact is too stiff for the steps of its law: {:.1g} of the impulse would be left out; take the "
+    "model 'full'"
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

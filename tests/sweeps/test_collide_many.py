@@ -276,6 +276,16 @@ def test_friction_and_restitution_vary_too() -> None:
     np.testing.assert_allclose(rigid["impulse_Ns"], (1 + e) * rigid["impulse_Ns"][0], rtol=1e-9)
 
 
+def test_a_contact_too_stiff_for_its_friction_has_a_model_that_takes_it() -> None:
+    """It was told to give a step, which neither the command nor a file has."""
+    data = {**arm_file().data, "friction": {"coefficient": 0.5}, "contact": {"stiffness_N_m": 1e7}}
+    data["contact"]["damping_N_s_m"] = 50.0
+    file, given = problem_file_from_data(data, where="stiff.toml"), {"posture": "ready", "speed_m_s": 0.5}
+    with pytest.raises(InputError, match=r"take full dynamics \(\[at_contact\] model, or --model: 'full'\)"):
+        collide_once(file, given)
+    assert collide_once(file, {**given, "model": "full"})["impulse_Ns"] > 0
+
+
 def test_gains_and_limits_are_the_robots_of_the_file_with_them() -> None:
     """The default of Kp is 30 1/s times Kd."""
     robot, given = load_robot("planar_arm"), {"posture": "ready", "speed_m_s": 1.0}

@@ -520,12 +520,4 @@ def _collide(model: CollisionModel, state: States, section: AtContact) -> Collis
     known = getattr(model, "settings", settings)
     given = {name: x for name, x in settings.items() if name in known}
     q, v, torque = state.q[0], state.v[0], state.torque[0]
-    try:
-        return model.collide(q, v, torque, require_separation=False, **given)
-    except InputError as error:
-        if not str(error).startswith("step [s]"):
-            raise
-        raise InputError(  # a step can be given in Python only
-            f"[contact]: with [friction] it is too stiff for the steps of {section.model!r}: take full "
-            f"dynamics ([at_contact] model, or --model: 'full'), or a softer contact ({error})"
-        ) from error
+    return model.collide(q, v, torque, require_separation=False, **given)

@@ -145,6 +145,7 @@ def _target_part(target: Target) -> tuple[Any, tuple[Any, Any]]:
 # default step [s] by method: spacing of the histories of implicit steps; the paper's Runge-Kutta steps
 STEPS = {"implicit": 1e-3, "rk4": 1e-4}
 _MOST_STEPS = 50_000  # to the horizon
+TAKE_FULL = "take FullDynamics ([at_contact] model, or --model: 'full')"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -255,7 +256,7 @@ class SteppedModel(CollisionModel):
             raise InputError(
                 f"step [s]: {self.step_length:g} is unstable {where}, where the fastest mode allows "
                 f"{longest:.2g}: give {type(self).__name__} a step below that, or the joints less kd or more "
-                f"armature{more}"
+                f"armature{more}, or {TAKE_FULL}"
             )
 
     def check_grips(self, v: NDArray[np.float64] | None = None) -> None:
@@ -269,7 +270,7 @@ class SteppedModel(CollisionModel):
         names = ", ".join(np.array(self.robot.joint_names)[grips])
         raise InputError(
             f"{names}: in {type(self).__name__} the rest angle of a soft grip's spring would move with the "
-            "joint, and the grip moves at contact: take FullDynamics ([at_contact] model, or --model: 'full')"
+            f"joint, and the grip moves at contact: {TAKE_FULL}"
         )
 
     @cached_property

@@ -281,8 +281,10 @@ def test_a_contact_too_stiff_for_its_friction_has_a_model_that_takes_it() -> Non
     data = {**arm_file().data, "friction": {"coefficient": 0.5}, "contact": {"stiffness_N_m": 1e7}}
     data["contact"]["damping_N_s_m"] = 50.0
     file, given = problem_file_from_data(data, where="stiff.toml"), {"posture": "ready", "speed_m_s": 0.5}
-    with pytest.raises(InputError, match=r"take full dynamics \(\[at_contact\] model, or --model: 'full'\)"):
+    with pytest.raises(InputError, match=r"take FullDynamics \(\[at_contact\] model, or --model: 'full'\)"):
         collide_once(file, given)
+    with pytest.raises(InputError, match=r"in every collision, as in the first, where .* take FullDynamics"):
+        collide_many(file, {"contact.stiffness": [1e8]}, at_contact=given)
     assert collide_once(file, {**given, "model": "full"})["impulse_Ns"] > 0
 
 

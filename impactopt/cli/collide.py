@@ -35,7 +35,9 @@ def collide(
     posture: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="A posture of the robot by name; left out: a reach to the problem's point."
+            metavar="NAME",
+            help="A posture of the robot by name, on soles as it has them, whatever steps the stances have; "
+            "left out: a reach to the problem's point.",
         ),
     ] = None,
     model: Annotated[Model, typer.Option(help="Model of the collision.")] = "sdc",

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import ceil
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
@@ -16,6 +18,7 @@ from impactopt.collide.contact_states import ContactStates, States
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.sdc import frozen_model
+from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact.friction import tangential_outcome
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_choice
@@ -25,7 +28,7 @@ from impactopt.files.sections.diagnostics import mistakes_of, report_mistakes
 from impactopt.files.sections.reading import CollisionFile
 from impactopt.files.sections.values import Positive, Section
 from impactopt.files.toml import read_toml
-from impactopt.kinematics.stance import Stance
+from impactopt.kinematics.stance import Free, Stance
 from impactopt.kinematics.support import margin, zmp
 from impactopt.problem.checks import MOST_FREEZES
 from impactopt.robots.loads import weight_of
@@ -47,10 +50,11 @@ class AtContact(Section):
 
     The state at contact is that of `result`, a directory of `impactopt solve` or `strike`; or of `posture`:
     "reach" for the problem's start posture with the striking point moved to the problem's point, or a
-    posture of the robot by name, with the target at its hand. `joints` are added to it. The striking point
-    moves along the normal at `speed`: a result's velocity is scaled; a posture gets the `velocity` of least
-    kinetic energy, or that of the least sum of squares of joint velocities over their limits. The
-    feed-forward torque keeps the joint velocities. Scales multiply the robot's gains and torque limits.
+    posture of the robot by name, with the target at its hand, and its soles where it has them, whatever steps
+    [[stances]] has. `joints` are added to it. The striking point moves along the normal at `speed`: a
+    result's velocity is scaled; a posture gets the `velocity` of least kinetic energy, or that of the least
+    sum of squares of joint velocities over their limits. The feed-forward torque keeps the joint velocities.
+    Scales multiply the robot's gains and torque limits.
     """
 
     posture: str = "reach"
@@ -138,6 +142,31 @@ def collision_model(
     return frozen_model(section.model, section.freezes, accuracy=accuracy, **options)
 
 
+# instants that histories have of a contact at least: with fewer they miss its peak by more than 1 %
+_INSTANTS = 10
+
+
+def finer(model: CollisionModel, durations: Array) -> Iterator[tuple[CollisionModel, NDArray[np.intp]]]:
+    """Models with `_INSTANTS` in contacts of these durations (N) [s], each with the indices of its contacts.
+
+    There are none for contacts in which the model itself has so many.
+    """
+    if not isinstance(model, SymbolicModel) or model.stepping != "implicit":
+        return  # full dynamics have more, Runge-Kutta's steps resolve the contact, an impact takes no time
+    # powers of ten, as compiled functions depend on the step
+    with np.errstate(divide="ignore", invalid="ignore"):
+        powers = np.floor(np.log10(durations / _INSTANTS))
+    for power in np.unique(powers[np.isfinite(powers)]):
+        if 10.0**power < model.step_length:
+            yield _with_step(model, 10.0**power), np.flatnonzero(powers == power)
+
+
+@lru_cache(maxsize=32)  # a model holds its loaded functions
+def _with_step(model: SymbolicModel, step: float) -> SymbolicModel:
+    # `finer`'s contacts last less than a hundred steps; histories have as many columns as a horizon has steps
+    return replace(model, step=step, horizon=min(model.horizon, 200 * step))
+
+
 LEAST_LOAD = 1e-3  # vertical force on the ground over the weight; with less the ZMP is undefined
 
 
@@ -175,13 +204,23 @@ def _velocity_ratio(batch: CollisionResults) -> Array:
     return np.asarray((joints / batch.robot.velocity_limit).max(axis=1))
 
 
+def zmp_margins(robot: Robot, polygon: Array, ground: Array) -> Array:
+    """Distances (k) [m] of the ZMP from the edges of a support polygon, positive inside.
+
+    Minus infinity where the ground carries no load, or would have to pull.
+
+    polygon (c, 2) [m].  ground (k, 6) : wrenches as of `Collision`.
+    """
+    out = np.full(len(ground), -np.inf)
+    stands = ground[:, 2] > LEAST_LOAD * weight_of(robot)
+    out[stands] = margin(polygon, zmp(ground[stands]))
+    return out
+
+
 def _zmp_margin(batch: CollisionResults) -> Array:
     ground = batch.found["ground_wrench"]
-    flat = ground.reshape(-1, 6)
-    out = np.full(len(flat), -np.inf)
-    stands = flat[:, 2] > LEAST_LOAD * weight_of(batch.robot)
-    out[stands] = margin(batch.polygon, zmp(flat[stands]))
-    return out.reshape(ground.shape[:2]).min(axis=1)
+    inside = zmp_margins(batch.robot, batch.polygon, ground.reshape(-1, 6))
+    return np.asarray(inside.reshape(ground.shape[:2]).min(axis=1))
 
 
 MEASURES: Mapping[str, Measure] = {
@@ -197,18 +236,20 @@ MEASURES: Mapping[str, Measure] = {
     "energy_J": Measure(outputs=("energy",), what="given to the target", of=lambda b: b.found["energy"]),
     "torque_ratio": Measure(
         outputs=("demand",),
-        what="largest torque demand over its joint's limit, at every millisecond of contact",
+        what="largest torque demand over its joint's limit, at every millisecond of contact and ten "
+        "times at least",
         of=_torque_ratio,
     ),
     "zmp_margin_m": Measure(
         outputs=("ground_wrench",),
         what="least distance of the ZMP from the soles' hull, positive inside, at every millisecond of "
-        "contact; minus infinity where they carry no load, or would have to pull",
+        "contact and ten times at least; minus infinity where they carry no load, or would have to pull",
         of=_zmp_margin,
     ),
     "sole_force_N": Measure(
         outputs=("sole_wrench",),
-        what="least vertical force of the ground on one sole, at every millisecond of contact",
+        what="least vertical force of the ground on one sole, at every millisecond of contact and ten times "
+        "at least",
         of=lambda b: b.found["sole_wrench"][..., 2].min(axis=(1, 2)),
     ),
     "freeze_error_pct": Measure(
@@ -229,6 +270,11 @@ MEASURES: Mapping[str, Measure] = {
         outputs=(), what="largest joint speed at contact over its limit", of=_velocity_ratio
     ),
 }
+
+
+def weightless(model: CollisionModel) -> bool:
+    """True if forces on single soles lack the weight, as in a model without bias forces."""
+    return isinstance(model, SymbolicModel) and not model.effects.bias
 
 
 def chosen(names: Iterable[str], target: Target) -> dict[str, Measure]:
@@ -333,7 +379,9 @@ def collide_once(
 
     Returns the measures of docs/sweeps.md; ``target``, its results after the collision; ``joints``, the
     largest torque demand [N m] and the limit of each, by decreasing ratio; and ``caution`` if the estimated
-    error of freezing is too large. If the collision is impossible there is only ``reason``.
+    error of freezing is too large, ``again`` if the target is touched again, which no measure has, and
+    ``drifts`` if a robot that floats freely has momentum. If the collision is impossible there is only
+    ``reason``.
     For a saved result with unchanged contact also ``saved`` (`planned_numbers`), and ``believe``, which of
     its numbers and the model's to trust if they differ.
 
@@ -343,6 +391,8 @@ def collide_once(
     """
     section, content = check_at_contact(at_contact), file.content
     record = None if section.result is None else load_record(section.result)
+    # a horizon of the caller's may be shorter than the saved contact
+    misplaced = section.result is not None and "horizon" not in section.model_fields_set and section.freezes
     if record is not None and "horizon" not in section.model_fields_set:
         section = section.model_copy(update={"horizon": _horizon(record, section.horizon)})
     robot = content.make_robot(file.path.parent)
@@ -364,8 +414,9 @@ def collide_once(
     if state.reason[0]:
         return {**head, "reason": str(state.reason[0])}
     collision = _collide(model, state, section)
+    for resolving, _ in finer(model, np.array([collision.duration])):
+        collision = _collide(resolving, state, section)
     if not collision.separated:
-        misplaced = record is not None and section.model == "sdc"
         return {**head, "reason": _CONTACT_DOES_NOT_END if misplaced else NOT_ENDED}
     found: dict[str, Any] = {}
     for name in dict.fromkeys(name for m in MEASURES.values() for name in m.outputs):
@@ -380,13 +431,50 @@ def collide_once(
         polygon=posture.polygon,
     )
     available = {name: m for name, m in MEASURES.items() if all(found[o] is not None for o in m.outputs)}
+    if weightless(model):
+        available.pop("sole_force_N", None)
     numbers = {name: float(measure.of(batch)[0]) for name, measure in available.items()}
     target = model.target.with_units(collision.target_result.values())
     if collision.tangential_velocity is not None:
         target |= tangential_outcome(collision.tangential_velocity)
     found = {**head, **numbers, "target": target, "joints": _joints(collision, robot, limit)}
     found |= {"caution": collision.caution} if collision.caution else {}
+    again = meets_again(model.target, collision)
+    found |= {"again": again} if again else {}
+    if record is None and (drifts := _drifts(robot, stance, state.q[0], state.v[0])):
+        found |= {"drifts": drifts}
     return plain(found | ({} if record is None else _saved(file, section, record)))
+
+
+_STILL_APPROACHES = 0.05  # speed after a touch over the speed of approach; less is a push of the servo
+
+
+def meets_again(target: Target, collision: Collision) -> str:
+    """Caution about a nail or a board that the striker, still on its way, touches again; "" if it does not.
+
+    They slow down after the touch, which ends as soon as they are ahead of the striker.
+    """
+    if not target.met_again or collision.target_result.get("broken"):
+        return ""
+    before, *_, after = collision.hand_speed - float(target.speed_before())
+    if not after > _STILL_APPROACHES * before:
+        return ""
+    return (
+        f"the striker goes on at {collision.hand_speed[-1]:.3g} m/s and touches the {target.word} again: "
+        "this is the first touch alone, and the replays of a plan (impactopt solve) have all of them"
+    )
+
+
+def _drifts(robot: Robot, stance: Stance, q: Array, v: Array) -> str:
+    """Caution about momentum of a robot that floats without gravity at q (nq,), v (nv,); "" on a stance."""
+    if not isinstance(stance, Free) or robot.model.gravity.linear.any():
+        return ""
+    momentum = pin.computeCentroidalMomentum(robot.model, robot.model.createData(), q, v)
+    return (
+        f"the floating robot has a momentum of {np.linalg.norm(momentum.linear):.3g} N s and "
+        f"{np.linalg.norm(momentum.angular):.3g} N m s at contact: one that begins at rest has none, and "
+        "needs faster joints; take a result of impactopt solve"
+    )
 
 
 def _horizon(record: Record, default: float) -> float:

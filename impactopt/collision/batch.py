@@ -154,7 +154,7 @@ class Batch:
         if unstable.all():
             one = {name: given[name][0].reshape(x.shape) for name, x in self.model.settings.items()}
             longest = self._stability.longest(self._stability.frozen(given["q"][0], one), one)
-            self.model.check_step(longest, "in every collision, as in the first,")
+            self.model.check_step(longest, "in every collision, as in the first")
         return unstable
 
     def _shaped(self, name: str, flat: Array, shape: tuple[int, int]) -> Array:

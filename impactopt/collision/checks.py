@@ -20,7 +20,7 @@ from impactopt.collision.graph import frozen_dynamics, joint_space_model
 from impactopt.collision.interface import Collision
 from impactopt.collision.model import JointSpaceModel
 from impactopt.collision.runge_kutta import rate_of_change
-from impactopt.collision.stepped import SteppedModel
+from impactopt.collision.stepped import TAKE_FULL, SteppedModel
 from impactopt.contact import Board
 from impactopt.errors import InputError
 
@@ -162,14 +162,14 @@ def check_steps(collision: SteppedModel, result: Collision, error: float) -> Non
     if without_contact(np.array(result.impulse), np.array(result.duration), within):
         raise InputError(
             f"step [s]: the contact ends within {result.duration:.2g} s, too soon for steps of "
-            f"{length:g}: give a shorter step, or a v that approaches faster"
+            f"{length:g}: give a shorter step, or a v that approaches faster, or {TAKE_FULL}"
         )
     if too_large(method, np.array(error)):
         # the estimate is not exact, so the step that is advised is a fifth shorter than by its order
         shorter = 0.8 * length * (ACCURACY[method] / error) ** (1 / _ORDERS[method])
         raise InputError(
             f"step [s]: {length:g} is too long to follow this contact within {ACCURACY[method]:g} of its "
-            f"impulse, whose estimated error is {error:.2g}: give a step below {shorter:.2g}"
+            f"impulse, whose estimated error is {error:.2g}: give a step below {shorter:.2g}, or {TAKE_FULL}"
         )
 
 

@@ -44,7 +44,8 @@ class Collision:
     torque, demand : (k, n) [N m] of the servo, after and before saturation. These, the joint velocities and
         all wrenches are None of a point mass and a rigid impact.
     sole_wrench : (k, soles, 6) [N, N m] of the ground on each fixed sole, world axes, at the sole's frame;
-        in the stance's order of soles. None on a fixed base.
+        in the stance's order of soles. None on a fixed base. Without `Effects.bias` they lack what carries
+        the weight, which ground_wrench and zmp have.
     hand_wrench : (k, hands, 6) [N, N m] of the world on each supporting hand, world axes, at its striking
         point; in the stance's order of hands. None without supporting hands.
     ground_wrench : (k, 6) [N, N m] of the ground on the robot, world axes, about the world's origin; None

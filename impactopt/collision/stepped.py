@@ -145,6 +145,7 @@ def _target_part(target: Target) -> tuple[Any, tuple[Any, Any]]:
 # default step [s] by method: spacing of the histories of implicit steps; the paper's Runge-Kutta steps
 STEPS = {"implicit": 1e-3, "rk4": 1e-4}
 _MOST_STEPS = 50_000  # to the horizon
+TAKE_FULL = "take FullDynamics ([at_contact] model, or --model: 'full')"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -160,7 +161,8 @@ class SteppedModel(CollisionModel):
         exact to 1e-2 of the impulse (of a plastic impact's, if contact ends early). `collide` refuses steps
         whose estimated error is larger.
     step : [s]. With "rk4" the length of its steps, below `stable_step(q)`; None: the paper's 1e-4. With
-        "implicit", which chooses its own steps, the spacing of histories; None: 1e-3.
+        "implicit", which chooses its own steps, the spacing of histories; None: 1e-3. Of shorter contacts
+        histories have the ends alone, where there is no force: give a tenth of the contact's duration.
     tolerance : with "implicit", the permitted error of one step: in the hand's speed and in the impulse,
         relative to their changes, and in the target's switching functions, relative to their terms. The
         impulse is mostly as exact as that. Errors add up in long contacts in which a servo oscillates
@@ -254,7 +256,7 @@ class SteppedModel(CollisionModel):
             raise InputError(
                 f"step [s]: {self.step_length:g} is unstable {where}, where the fastest mode allows "
                 f"{longest:.2g}: give {type(self).__name__} a step below that, or the joints less kd or more "
-                f"armature{more}"
+                f"armature{more}, or {TAKE_FULL}"
             )
 
     def check_grips(self, v: NDArray[np.float64] | None = None) -> None:
@@ -268,7 +270,7 @@ class SteppedModel(CollisionModel):
         names = ", ".join(np.array(self.robot.joint_names)[grips])
         raise InputError(
             f"{names}: in {type(self).__name__} the rest angle of a soft grip's spring would move with the "
-            "joint, and the grip moves at contact: take FullDynamics ([at_contact] model, or --model: 'full')"
+            f"joint, and the grip moves at contact: {TAKE_FULL}"
         )
 
     @cached_property

@@ -111,7 +111,8 @@ def striking_velocity(
 
     Frames fixed by the stance (None: all soles, or the fixed base) are at rest. The striking point does not
     move at right angles to the normal (3,), a unit vector; its rotation is free. Least energy, unlike a least
-    norm, does not depend on the joints' units, and makes heavy links move little.
+    norm, does not depend on the joints' units, and makes heavy links move little. A robot that floats freely
+    then has momentum, which it cannot give itself.
 
     Raises
     ------

@@ -13,10 +13,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.collide.contact_states import NOT_APPROACHING
+from impactopt.collide.single_collision import finer, meets_again, zmp_margins
 from impactopt.collision import SDC, Collision
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
-from impactopt.kinematics.support import margin, support_polygon
+from impactopt.kinematics.support import support_polygon
 from impactopt.live.drawing import Drawing, Moment
 from impactopt.live.requests import LatestRequest
 from impactopt.live.server import LOCAL, LivePage, served
@@ -129,6 +130,8 @@ class CollisionPage(LivePage):
             v = striking_velocity(p.robot, q, p.striker, p.normal, speed, stance=p.stance)
             torque = holding_torque(p.robot, q, v, stance=p.stance)
             collision = self._model.collide(q, v, torque, require_separation=False)
+            for model, _ in finer(self._model, np.array([collision.duration])):
+                collision = model.collide(q, v, torque, require_separation=False)
         except InputError as error:
             return ShownCollision(q=q, seconds=time.perf_counter() - began, why=str(error))
         why = "" if collision.separated else "the contact does not end"
@@ -152,7 +155,7 @@ class CollisionPage(LivePage):
         zmp = np.full(2, np.nan)
         if collision is not None and collision.zmp is not None and len(self._polygon):
             # drawn where its margin is least
-            inside = margin(self._polygon, collision.zmp)
+            inside = self._margins(collision)
             zmp = collision.zmp[int(np.argmin(np.where(np.isfinite(inside), inside, np.inf)))]
             path = np.column_stack([collision.zmp, np.zeros(len(collision.zmp))])
             self._drawing.path("/path of the ZMP", path)
@@ -172,16 +175,25 @@ class CollisionPage(LivePage):
             )
         )
 
+    def _margins(self, collision: Collision) -> Array:
+        """Margins (k,) [m] of the ZMP, minus infinity without a load on the ground."""
+        assert collision.ground_wrench is not None
+        return zmp_margins(self.problem.robot, self._polygon, collision.ground_wrench)
+
     def _summary(self, shown: ShownCollision) -> str:
         collision = shown.collision
         if collision is None:
             return f"**No collision.** {shown.why}"
         lines = [f"**{collision.impulse:.3g} N s**" + (f" ({shown.why})" if shown.why else "")]
         lines.append(f"- {collision.peak_force:.0f} N at most, for {1e3 * collision.duration:.1f} ms")
+        if again := meets_again(self.problem.target, collision):
+            lines.append(f"- {again}")
         if collision.zmp is not None and len(self._polygon):
-            inside = float(np.min(margin(self._polygon, collision.zmp)))
+            inside = float(self._margins(collision).min())
             lines.append(
                 f"- ZMP margin {1e3 * inside:.0f} mm" + ("" if inside > 0 else ": it leaves the soles")
+                if np.isfinite(inside)
+                else "- no ZMP: the ground would have to pull the soles"
             )
         if collision.demand is not None:
             ratio = np.abs(collision.demand / self.problem.robot.torque_limit).max(axis=0)

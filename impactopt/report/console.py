@@ -181,8 +181,10 @@ def collision_table(found: Mapping[str, Any]) -> Table:
     """Table of one collision and those of a saved result; `found` as in `impactopt collide --json`."""
     model = f"{found['model']}, freezes = {found['freezes']}" if found.get("freezes") else found["model"]
     table = _empty(f"{found['problem']}: {model}", "", "collision", *(found.get("saved") or {}))
-    notes = [f"caution: {found['caution']}"] if found.get("caution") else []
+    notes = [f"caution: {found[key]}" for key in ("caution", "again", "drifts") if found.get(key)]
     notes += [f"{found['model']}: {found['believe']}"] if "believe" in found else []
+    if found["model"] == "sdc-paper" and "believe" not in found:
+        notes.append("torque demands without those that carry the weight: this model has no feed-forward")
     notes += ["no peak force: the impact takes no time"] if found["model"] == "rigid" else []
     if notes:
         table.caption, table.caption_justify = _plain("\n".join(notes)), "left"

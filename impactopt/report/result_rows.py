@@ -129,7 +129,7 @@ def contact_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
         ("contact time [ms]", "contact_ms", 1),
         ("speed at contact [m/s]", "hand_speed_m_s", 3),
     ):
-        yield number_row(label, [source.get(key) for source in sources], digits)
+        yield number_row(label, [source.get(key) for source in sources], digits, small=True)
     yield from target_rows([source.get("target") or {} for source in sources])
 
 
@@ -146,10 +146,20 @@ def phase_rows(sources: Sequence[Mapping[str, Any]], phases: Iterable[str]) -> I
 
 def collision_rows(found: Mapping[str, Any]) -> list[Row]:
     """Rows of one collision and those of a saved result; `found` as in `impactopt collide --json`."""
-    sources = [found, *(found.get("saved") or {}).values()]
+    sources = [dict(x) for x in (found, *(found.get("saved") or {}).values())]
     most_uncertain = -np.inf if found.get("caution") else np.inf
+    # null: at some instant the ground carries no load, or would have to pull
+    sources = [x | {"zmp_margin_m": -np.inf} if x.get("zmp_margin_m", 0) is None else x for x in sources]
     rows = [
-        number_row(label, [x.get(key) for x in sources], digits, scale=scale, least=least, most=most)
+        number_row(
+            label,
+            [x.get(key) for x in sources],
+            digits,
+            scale=scale,
+            least=least,
+            most=most,
+            small=least < 0 and key != "freeze_error_pct",
+        )
         for label, key, digits, scale, least, most in (
             ("speed at contact [m/s]", "hand_speed_m_s", 3, 1.0, -np.inf, np.inf),
             ("effective mass [kg]", "effective_mass_kg", 2, 1.0, -np.inf, np.inf),
@@ -188,10 +198,12 @@ def worst_constraints(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str
 
 def target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     """Rows of the impact's effects on the target."""
-    yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
+    speeds = [target.get("speed_m_s") for target in targets]
+    yield number_row("speed of the target [m/s]", speeds, 3, small=True)
     across = [target.get("tangential_speed_m_s") for target in targets]
-    yield number_row("speed of the target across the normal [m/s]", across, 3)
-    yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
+    yield number_row("speed of the target across the normal [m/s]", across, 3, small=True)
+    depths = [target.get("depth_m") for target in targets]
+    yield number_row("driven into the wood [mm]", depths, 2, scale=1e3, small=True)
     yield word_row("the board breaks", [target.get("broken") for target in targets])
 
 
@@ -229,19 +241,25 @@ def number_row(
     scale: float = 1.0,
     least: float | NDArray[np.float64] = -np.inf,
     most: float = np.inf,
+    small: bool = False,
 ) -> Row | None:
-    """Row of numbers, good between `least` (of all, or of each) and `most`; None without any number."""
+    """Row of numbers, good between `least` (of all, or of each) and `most`; None without any number.
+
+    small : numbers keep two digits however small they are, as impulses of a target of grams.
+    """
     if all(value is None for value in values):
         return None
     cells = [
-        Cell("-") if v is None else Cell(_rounded(scale * v, digits), bool(low <= v <= most))
+        Cell("-") if v is None else Cell(_rounded(scale * v, digits, small=small), bool(low <= v <= most))
         for v, low in zip(values, np.broadcast_to(least, len(values)), strict=True)
     ]
     return Row(label, tuple(cells))
 
 
-def _rounded(value: float, digits: int) -> str:
+def _rounded(value: float, digits: int, *, small: bool = False) -> str:
     """Rounded number as text; a zero has no sign."""
+    if small and 0 < abs(value) < 10.0 ** (1 - digits):
+        return f"{value:.2g}"
     text = f"{value:.{digits}f}"
     return text.lstrip("-") if float(text) == 0 else text
 

@@ -25,8 +25,10 @@ from impactopt.collide.single_collision import (
     check_at_contact,
     chosen,
     collision_model,
+    finer,
     full_names,
     servo_settings,
+    weightless,
 )
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.checks import FREEZE_ERROR, too_large
@@ -128,7 +130,10 @@ NO_NUMBER = (
     "the collision has no finite numbers: its steps are unstable here, or the constraints that fix the robot "
     "are linearly dependent"
 )
-TOO_STIFF = "the contact is too stiff for the steps of its law: {:.1g} of the impulse would be left out"
+TOO_STIFF = (
+    "the contact is too stiff for the steps of its law: {:.1g} of the impulse would be left out; take the "
+    "model 'full'"
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -220,13 +225,34 @@ class CollisionBatch:
         states = states.some(good)
         settings = {name: x[good] if len(x) == count else x for name, x in settings.items()}
         settings |= states.reference_settings
+        values, durations = self._measured(model, states, settings, posture, threads)
+        if {*self._outputs} & {*HISTORIES}:
+            for resolving, some in finer(model, durations):
+                theirs = {name: x[some] if len(x) == len(good) else x for name, x in settings.items()}
+                better, _ = self._measured(resolving, states.some(some), theirs, posture, threads)
+                for name, x in better.items():
+                    values[name][some] = x
+        for name, x in values.items():
+            out[name][good] = x
+        return out
+
+    def _measured(
+        self,
+        model: CollisionModel,
+        states: States,
+        settings: Mapping[str, Array],
+        posture: Posture,
+        threads: int | None,
+    ) -> tuple[dict[str, NDArray[Any]], Array]:
+        """Values (count,) as of `__call__` for states at contact, and durations (count,) [s] of contacts."""
         # a point mass has no servo, and the paper's SDC no stiffness
         known = getattr(model, "settings", settings)
         given = {name: x for name, x in settings.items() if name in known}
+        outputs = tuple(dict.fromkeys((*self._outputs, "duration")))
         if isinstance(model, SymbolicModel):
-            found, reason = batch(model, self._outputs, states, given, threads)
+            found, reason = batch(model, outputs, states, given, threads)
         else:
-            found, reason = one_by_one(model, self._outputs, states, given)
+            found, reason = one_by_one(model, outputs, states, given)
         collisions = CollisionResults(
             found=found,
             states=states,
@@ -234,10 +260,11 @@ class CollisionBatch:
             torque_limit=settings["torque_limit"],
             polygon=posture.polygon,
         )
-        for name, measure in self.measures.items():
-            out[name][good] = np.where(reason == "", measure.of(collisions), np.nan)
-        out["reason"][good] = reason
-        return out
+        values: dict[str, NDArray[Any]] = {
+            name: np.where(reason == "", measure.of(collisions), np.nan)
+            for name, measure in self.measures.items()
+        }
+        return {**values, "reason": reason}, found["duration"]
 
     def _settings(self, numbers: Numbers) -> dict[str, Array]:
         """Parameters of law, target and servo by their names in `Settings`, (count, ...) or (1, ...)."""
@@ -489,6 +516,11 @@ class Collisions:
                 model._check_outputs(tuple(needed), 1)
             elif isinstance(model, RigidImpact) and (unknown := [x for x in needed if x in OF_SERVO]):
                 raise InputError(f"output {unknown[0]!r}: a rigid impact knows nothing of it; leave it out")
+            if "sole_force_N" in measures and weightless(model):
+                raise InputError(
+                    f"output 'sole_force_N': the model {section.model!r} has no gravity, so that forces on "
+                    "single soles lack the weight; leave it out, or take 'sdc' or 'full'"
+                )
             self._batches[key] = CollisionBatch(
                 file=file, section=section, model=model, states=states, measures=measures
             )

@@ -78,8 +78,10 @@ class InstantImpact:
 
         self.du = add("change of rate", b.ny, labels=c.labels)
         of_impulse = Measure("N s", 1.0, "off")
-        # > 0, as the block divides by it
-        self.impulse_group = add("impulse", 1, lower=1e-3, scale=10.0, measure=of_impulse)
+        # > 0, as the block divides by it; a target or a robot of grams has less
+        robot_mass = sum(inertia.mass for inertia in b.robot.model.inertias)
+        least = 1e-3 * min(self.mass, robot_mass, 1.0)
+        self.impulse_group = add("impulse", 1, lower=least, scale=10.0, measure=of_impulse)
         # [N s, N m s]: the weight for 0.05 s
         scale = 0.05 * b.limits.wrench_scale
         self.w = add("impulsive sole wrench", b.nw, **{**b.limits.of_wrenches, "scale": scale})

@@ -12,7 +12,19 @@ import pytest
 from support.frozen_by_scipy import FrozenCollision
 from support.native_cases import FRICTION, HARDENING, ROBOTS, X, robot_named, situation
 
-from impactopt import SDC, Effects, FreeMass, HertzDamped, HuntCrossley, Nail, SpringDamper
+from impactopt import (
+    SDC,
+    Effects,
+    FreeMass,
+    HertzDamped,
+    HuntCrossley,
+    Nail,
+    SpringDamper,
+    VirtualMass,
+    effective_mass,
+    load_robot,
+    striking_velocity,
+)
 from impactopt.codegen.compiler import find_compiler
 from impactopt.collision.graph import collision_graph
 from impactopt.collision.implicit import NODES, STAGES, Contact, gamma, node_tables
@@ -100,6 +112,23 @@ def test_collisions_are_scipys(name: str) -> None:
     found = [float(x) for x in model._collision(OUTPUTS)(*values)]
     assert found[0] == pytest.approx(impulse, rel=1e-6)
     assert found[1] == pytest.approx(duration, rel=1e-6)
+
+
+@pytest.mark.parametrize(("deep", "most"), [(1e-4, 3e-4), (1e-5, 3e-3), (1e-6, 0.08)])
+def test_shallow_contacts_of_hertz_are_damped_less(deep: float, most: float) -> None:
+    """Impulse over Tsuji's, by how deep [m] two point masses would be without damping."""
+    robot, normal, hit, speed, ratio = load_robot("planar_arm"), [0.0, 0.0, -1.0], 0.01, 0.5, 1.5
+    q = robot.posture("ready")
+    v = striking_velocity(robot, q, "hammer", normal, speed)
+    own = float(effective_mass(robot, striker="hammer", normal=normal)(q))
+    both = 1 / (1 / own + 1 / hit)
+    stiffness = 1.25 * both * speed**2 / deep**2.5  # both speed^2 / 2 = 2/5 stiffness deep^2.5
+    law = HertzDamped(stiffness=stiffness, damping=ratio * np.sqrt(stiffness * both))
+    scene: dict[str, Any] = {"robot": robot, "striker": "hammer", "normal": normal, "law": law}
+    found = VirtualMass(**scene, target=FreeMass(mass=hit)).collide(q, v)
+    zeta = ratio / np.sqrt(5)
+    restitution = np.exp(-2 * zeta * np.arccos(zeta) / np.sqrt(1 - zeta**2))
+    assert 0 < found.impulse / ((1 + restitution) * both * speed) - 1 < most
 
 
 def test_the_error_falls_with_the_tolerance() -> None:

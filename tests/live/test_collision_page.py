@@ -16,6 +16,7 @@ from impactopt import (
     FreeMass,
     ImpactProblem,
     InputError,
+    KelvinVoigt,
     SpringDamper,
     holding_torque,
     load_problem,
@@ -99,3 +100,22 @@ def test_a_slider_has_the_unit_of_its_joint(look: CollisionPage) -> None:
     )
     with CollisionPage(problem) as page:
         assert page.joints["rail"].label == "rail [m]"
+
+
+def test_a_nail_that_jumps_ahead_is_touched_again() -> None:
+    stiff = replace(load_problem(FILE), law=KelvinVoigt(stiffness=1e7, damping=0.0))
+    with CollisionPage(stiff) as page:
+        page.speed.value = 3.0
+        assert page.wait(LONG)
+        assert "touches the nail again" in page.text.content
+
+
+@pytest.mark.slow
+def test_soles_that_the_ground_would_have_to_pull() -> None:
+    """A stiff contact of half a millisecond: the page told the ZMP of its ends."""
+    problem = load_problem(FILE.with_name("punch_standin.toml"))
+    with CollisionPage(replace(problem, law=SpringDamper(stiffness=1e8, damping=0.0))) as page:
+        assert page.wait(LONG)
+        assert page.shown.collision is not None and page.shown.collision.sole_wrench is not None
+        assert page.shown.collision.sole_wrench[..., 2].sum(axis=1).min() < 0
+        assert "no ZMP: the ground would have to pull the soles" in page.text.content

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.integrate import solve_ivp
 from support.fake_solution import strike_record
 from support.small_robots import arm, biped
 
@@ -32,8 +33,12 @@ from impactopt.collide.contact_states import ContactStates, Posture
 from impactopt.collide.single_collision import collide_once
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.files.sections.reading import CollisionFile
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin
+from impactopt.report.console import collision_table
+from impactopt.report.result_rows import collision_rows, contact_rows
 from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.collisions import Collisions
 
@@ -142,6 +147,99 @@ def test_of_a_robot_on_soles_with_its_margins() -> None:
         assert found["torque_ratio"][i] == pytest.approx(np.abs(one.demand / limit).max(), rel=1e-9)
 
 
+@pytest.mark.slow
+def test_loads_of_the_ground_in_a_contact_of_less_than_a_millisecond() -> None:
+    """They are largest in the middle of the contact, as full dynamics have them."""
+    outputs = ("zmp_margin_m", "sole_force_N", "torque_ratio")
+    columns = {"contact.stiffness": [1e4, 1e6, 1e8, 1e8], "at_contact.speed": [0.5, 0.5, 0.25, 0.5]}
+    given = {"posture": "half_sitting"}
+    found = collide_many(standin_file(), columns, outputs=outputs, at_contact=given)
+    full = collide_many(standin_file(), columns, outputs=outputs, at_contact={**given, "model": "full"})
+    assert full["sole_force_N"][2] < 0 < full["sole_force_N"][1] and full["zmp_margin_m"][3] == -np.inf
+    for name in outputs:
+        assert found[name] == pytest.approx(full[name], rel=0.01, abs=1e-3 if name == "zmp_margin_m" else 2.0)
+    section = {**standin_file().data["contact"], "stiffness_N_m": 1e8}
+    stiff = problem_file_from_data({**standin_file().data, "contact": section}, where="stiff.toml")
+    once = collide_once(stiff, {**given, "speed_m_s": 0.5})
+    assert once["sole_force_N"] == pytest.approx(found["sole_force_N"][3], rel=1e-6)
+    assert once["zmp_margin_m"] is None
+
+
+def test_a_ground_without_load_is_in_the_table() -> None:
+    rows = {row.label: row.cells[0] for row in collision_rows({"zmp_margin_m": None, "sole_force_N": -10.0})}
+    assert rows["ZMP margin [mm]"].text == "-inf" and not rows["ZMP margin [mm]"].good
+    assert "ZMP margin [mm]" not in {row.label for row in collision_rows({"impulse_Ns": 1.0})}
+
+
+@pytest.mark.slow
+def test_a_model_without_gravity_has_no_forces_on_single_soles() -> None:
+    """The soles carry the weight however slow the hit is; the paper's model told of forces about zero."""
+    given = {"posture": "half_sitting", "speed_m_s": 1e-3}
+    paper = collide_once(standin_file(), {**given, "model": "sdc-paper"})
+    assert "sole_force_N" not in paper and "zmp_margin_m" in paper
+    assert "without those that carry the weight" in str(collision_table(paper).caption)
+    assert collide_once(standin_file(), given)["sole_force_N"] > 100.0
+
+
+@pytest.mark.parametrize(("stiffness", "again"), [(1e5, False), (1e7, True)])
+def test_a_nail_that_is_touched_again_is_told(stiffness: float, again: bool) -> None:
+    """Two point masses and the wood by SciPy: a nail that jumps ahead is driven on by later touches."""
+    nail = {"kind": "nail", "mass_kg": 0.05, "resistance_N": 600.0}
+    contact = {"law": "Kelvin-Voigt", "stiffness_N_m": stiffness, "damping_N_s_m": 20.0}
+    data = {**arm_file().data, "target": nail, "contact": contact}
+    given = {"posture": "ready", "speed_m_s": 3.0, "model": "virtual-mass"}
+    found = collide_once(problem_file_from_data(data, where="nail.toml"), given)
+
+    def motion(_: float, y: Any) -> list[float]:
+        hand, at, speed, moves = y
+        touches = hand > at
+        force = max(stiffness * (hand - at) + 20.0 * (speed - moves), 0.0) if touches else 0.0
+        push = force - 600.0
+        driven = push / 0.05 if moves > 0 or push > 0 else 0.0
+        return [speed, max(moves, 0.0), -force / found["effective_mass_kg"], driven]
+
+    later = solve_ivp(motion, (0.0, 0.02), [0.0, 0.0, 3.0, 0.0], method="LSODA", rtol=1e-7, max_step=1e-5)
+    driven, first = float(later.y[1, -1]), found["target"]["depth_m"]
+    assert ("again" in found) == again and ("again: " in str(collision_table(found).caption)) == again
+    if again:
+        assert driven > 2 * first
+    else:
+        assert driven == pytest.approx(first, rel=0.01)
+
+
+def test_a_floating_robot_that_has_momentum_is_told() -> None:
+    """Without it, as from rest, the joints are faster."""
+    problem = Path(__file__).resolve().parents[2] / "problems" / "space_arm.toml"
+    file, given = CollisionFile.read(problem), {"posture": "ready", "speed_m_s": 0.5}
+    found = collide_once(file, {**given, "model": "rigid"})
+    robot, normal = space_arm(), np.array(file.content.problem.normal)
+    q = robot.posture("ready")
+    v = striking_velocity(robot, q, file.content.problem.striker, normal, 0.5, stance=Free())
+    body = ConstrainedDynamics.at(robot.model, q, (), robot.striker(file.content.problem.striker).model_frame)
+    inertia = body.inertia
+    assert found["drifts"].startswith(
+        f"the floating robot has a momentum of {np.linalg.norm((inertia @ v)[:3]):.3g} N s"
+    )
+    assert "drifts" not in collide_once(standin_file(), {"speed_m_s": 0.3, "model": "rigid"})
+    # of least energy among those with the base's generalized momentum zero
+    rows = np.vstack([inertia[:6], body.hand])
+    needed = np.concatenate([np.zeros(6), 0.5 * normal])
+    responses = np.linalg.solve(inertia, rows.T)
+    from_rest = responses @ np.linalg.solve(rows @ responses, needed)
+    assert np.abs(from_rest[6:] / robot.velocity_limit).max() > 2 * found["velocity_ratio"]
+
+
+def test_the_table_has_two_digits_of_a_target_of_grams() -> None:
+    """A gram that 0.5 m/s hit: rounded to a thousandth, its impulse was off by a third."""
+    found = {"impulse_Ns": 7.46e-4, "energy_J": 2.79e-4, "peak_force_N": 0.0, "target": {"speed_m_s": 0.746}}
+    rows = {row.label: row.cells[0].text for row in collision_rows(found)}
+    assert float(rows["impulse [N s]"]) == pytest.approx(7.46e-4, rel=0.05)
+    assert float(rows["energy to the target [J]"]) == pytest.approx(2.79e-4, rel=0.05)
+    assert (rows["peak force [N]"], rows["speed of the target [m/s]"]) == ("0.0", "0.746")
+    (planned,) = (row for row in contact_rows([found]) if row is not None and row.label == "impulse [N s]")
+    assert planned.cells[0].text == "0.00075"
+
+
 def test_structure_may_differ_from_row_to_row() -> None:
     models = ["sdc", "virtual-mass", "sdc-paper", "sdc"]
     columns = {"at_contact.model": models, "target.mass": [0.5, 0.5, 0.5, 2.0], "at_contact.speed": [1.0]}
@@ -176,6 +274,18 @@ def test_friction_and_restitution_vary_too() -> None:
     columns = {"at_contact.speed": [1.0] * 3, "collision.coefficient_of_restitution": e.tolist()}
     rigid = collide_many(arm_file(), columns, at_contact={"model": "rigid"}, outputs=("impulse_Ns",))
     np.testing.assert_allclose(rigid["impulse_Ns"], (1 + e) * rigid["impulse_Ns"][0], rtol=1e-9)
+
+
+def test_a_contact_too_stiff_for_its_friction_has_a_model_that_takes_it() -> None:
+    """It was told to give a step, which neither the command nor a file has."""
+    data = {**arm_file().data, "friction": {"coefficient": 0.5}, "contact": {"stiffness_N_m": 1e7}}
+    data["contact"]["damping_N_s_m"] = 50.0
+    file, given = problem_file_from_data(data, where="stiff.toml"), {"posture": "ready", "speed_m_s": 0.5}
+    with pytest.raises(InputError, match=r"take FullDynamics \(\[at_contact\] model, or --model: 'full'\)"):
+        collide_once(file, given)
+    with pytest.raises(InputError, match=r"in every collision, as in the first, where .* take FullDynamics"):
+        collide_many(file, {"contact.stiffness": [1e8]}, at_contact=given)
+    assert collide_once(file, {**given, "model": "full"})["impulse_Ns"] > 0
 
 
 def test_gains_and_limits_are_the_robots_of_the_file_with_them() -> None:
@@ -365,6 +475,8 @@ def test_the_state_of_a_result(tmp_path: Path) -> None:
         arm_file(), {}, at_contact={"result": str(tmp_path)}, outputs=("impulse_Ns", "hand_speed_m_s")
     )
     assert as_saved["impulse_Ns"][0] == pytest.approx(model.collide(q, v, torque).impulse, rel=1e-9)
+    short = {"result": str(tmp_path), "freezes": 2, "horizon_s": 1e-3}
+    assert "raise it: at_contact.horizon_s" in collide_once(arm_file(), short)["reason"]
     twice = {"at_contact.speed": [2 * as_saved["hand_speed_m_s"][0]]}
     faster = collide_many(arm_file(), twice, at_contact={"result": str(tmp_path)})
     other = torque + holding_torque(robot, q, 2 * v) - holding_torque(robot, q, v)
@@ -462,6 +574,9 @@ def test_mistakes_in_what_is_asked_for() -> None:
         with pytest.raises(InputError, match=f"output 'demand': {what} knows nothing of it"):
             given = {"speed_m_s": 1.0, "model": model}
             collide_many(arm_file(), {}, outputs=("torque_ratio",), at_contact=given)
+    with pytest.raises(InputError, match="forces on single soles lack the weight"):
+        given = {"speed_m_s": 1.0, "model": "sdc-paper"}
+        collide_many(standin_file(), {}, outputs=("sole_force_N",), at_contact=given)
     with pytest.raises(InputError, match="which is held"):
         given = {"speed_m_s": 1.0, "joints_rad": {standin_leg(): 0.1}}
         collide_many(standin_file(), {}, at_contact=given)

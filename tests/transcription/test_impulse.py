@@ -14,7 +14,18 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from support.small_plans import LAW, OPTIONS, Planned, changed, planned
 
-from impactopt import ImpactProblem, Plan, Solution, Status, TorqueLimit, load_record
+from impactopt import (
+    FreeMass,
+    ImpactProblem,
+    KelvinVoigt,
+    Plan,
+    Solution,
+    Status,
+    TorqueLimit,
+    load_problem,
+    load_record,
+    solve,
+)
 from impactopt.files.output import record_of, save_record
 from impactopt.report.console import result_table
 from impactopt.report.pictures import PICTURES, save_pictures
@@ -25,6 +36,7 @@ from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 RESTITUTION = 0.3
+ARM = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
 KINDS: dict[str, dict[str, Any]] = {
     "rigid": {"collision": "rigid", "coefficient_of_restitution": RESTITUTION},
     "virtual-mass": {"collision": "virtual-mass"},
@@ -279,3 +291,15 @@ def test_torque_limits_of_the_collision_mean_nothing_to_it(arm_transcription: Tr
         t = changed(arm_transcription, collision="rigid", terms=(TorqueLimit(collision=collision),))
         found.append(solve_ipopt(t.program, first_iterate(t)).objective)
     assert found[0] == pytest.approx(found[1], rel=1e-9)
+
+
+def test_a_target_of_a_tenth_of_a_gram_has_its_impulse() -> None:
+    """Its impulse was bounded by 1e-3 N s, more than the hand can give it."""
+    problem = load_problem(ARM)
+    light = dataclasses.replace(
+        problem, target=FreeMass(mass=1e-4), law=KelvinVoigt(stiffness=100.0, damping=0.0), **KINDS["rigid"]
+    )
+    found = solve(light)
+    assert found.status is Status.SOLVED
+    # of the arm, whose effective mass is ten thousand times as large, it takes no speed
+    assert found.impulse / 1e-4 == pytest.approx((1 + RESTITUTION) * found.plan.hand_speed, rel=1e-3)

@@ -29,7 +29,14 @@ def check(
     with plain_errors("interrupted", verbose=verbose, as_json=as_json):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.feasibility import blocked, hopeless, overlapping, sticks_out, too_weak, unusual
+        from impactopt.problem.feasibility import (
+            blocked,
+            hopeless,
+            overlapping,
+            sticks_out,
+            too_weak,
+            unusual,
+        )
         from impactopt.problem.plausibility import doubts
 
         try:

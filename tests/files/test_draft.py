@@ -34,7 +34,7 @@ from impactopt import (
     optimize_strike,
     solve,
 )
-from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.bodies.robot_bodies import bodies_of, distance, transform
 from impactopt.bodies.visuals import visuals_of
 from impactopt.cli.app import app
 from impactopt.files.draft import strong
@@ -49,6 +49,7 @@ from impactopt.kinematics.operational_space import striking_point
 from impactopt.problem.feasibility import hopeless, sticks_out, too_weak
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.strength import best_share
+from impactopt.robots.presets import example_robots
 from impactopt.robots.urdf import read_urdf
 
 FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
@@ -88,6 +89,29 @@ def _striker(folder: Path, text: str) -> tuple[Striker, Any]:
     """The striker that a description's first arm gets, and its axis."""
     drafted = _robot(folder, text)
     return find_striker(drafted.robot.model, drafted.arms[0], "hand", drafted.pieces)
+
+
+@pytest.mark.slow
+def test_an_arm_beside_a_head_starts_clear_of_it(tmp_path: Path) -> None:
+    """Links that touch at the start were exempt, so Baxter's forearm could begin 15 cm inside its head."""
+    urdf = example_robots() / "baxter_description" / "urdf" / "baxter.urdf"
+    (tmp_path / "baxter.toml").write_text(draft_problem(urdf, folder=tmp_path, planned=False).text)
+    problem = load_problem(tmp_path / "baxter.toml")
+    model, data = problem.robot.model, problem.robot.model.createData()
+    pin.forwardKinematics(model, data, problem.start_posture)
+    of_joint = bodies_of(problem.robot).of_joint
+    arm = [model.getJointId(f"right_{name}") for name in ("e1", "w0", "w1", "w2")]
+    pairs = [(one, two, j) for j in arm for one in of_joint.get(j, ()) for two in of_joint[0]]
+    assert pairs and all(
+        distance(
+            one.shape,
+            transform(data.oMi[j].rotation, data.oMi[j].translation),
+            two.shape,
+            transform(np.eye(3), np.zeros(3)),
+        )
+        > 0
+        for one, two, j in pairs
+    )
 
 
 @pytest.mark.parametrize("arms", [False, True], ids=["legs", "arms"])

@@ -81,7 +81,7 @@ def test_starts_with_other_links_on_the_ground_have_other_bodies() -> None:
     (one, by_wrist), (other, by_elbow) = on_ground([-0.07, 2.03, 1.65]), on_ground([2.3, -1.56, 0.05])
     assert (by_wrist, by_elbow) == (["wrist"], ["elbow"])
     assert not same_bodies(one, other)
-    assert same_bodies(one, dataclasses.replace(one, point=one.point + [0.0, 0.0, 0.01]))
+    assert same_bodies(one, dataclasses.replace(one, point=one.point + np.array([0.0, 0.0, 0.01])))
 
 
 def test_bodies_that_are_near_at_the_start_may_not_penetrate_more_than_their_rounded_shapes() -> None:

@@ -128,7 +128,7 @@ class Bodies:
         """start (nq,) : posture; links within 1 mm in it are not checked.  normal (3,) : of the target.
 
         strict : refuse a start posture that penetrates a body of the world.
-        striking, standing : joints of the striking links, and of the fixed soles.
+        striking, standing : joints of the striking links, and of the feet on fixed soles.
         """
         self.robot, self.world, self.normal, self.striking = robot, world, normal, striking
         self.start, self.standing = start, standing
@@ -137,6 +137,7 @@ class Bodies:
         self.pairs, _ = self.links.piece_pairs(start, left_out)
         at = Places.of(robot, start[None], np.zeros(1), np.zeros(1, dtype=np.intp))
         self.world_pairs: list[Pair] = []
+        self._first_lowered = len(world)  # index of the first ground that is lowered for a link on it
         for w, body in enumerate(world):
             for j in self.links.joints:
                 # Fixed soles stand on the ground, and a fixed base is mounted on it.
@@ -309,7 +310,8 @@ class Bodies:
             if interval in seen:
                 continue
             distance = self.exact(at, k, pair)
-            if distance < least:
+            # a link that begins on the ground has no clearance from it
+            if distance < (min(least, 0.0) if -1 - pair[1] >= self._first_lowered else least):
                 least, when, which = distance, k, pair
             if distance < DEEPEST:
                 found.setdefault(pair, []).append((k, distance))

@@ -62,7 +62,11 @@ def same_bodies(one: ImpactProblem, other: ImpactProblem) -> bool:
     """True if clearance constraints have the same meaning in two problems."""
     if not (one.keeps_apart and other.keeps_apart) or one.robot is not other.robot:
         return False
-    return [body.name for body in one.bodies.world] == [body.name for body in other.bodies.world]
+    if [body.name for body in one.bodies.world] != [body.name for body in other.bodies.world]:
+        return False
+    # other links may touch, or be on the ground, in another start posture
+    here, there = one.bodies.shapes, other.bodies.shapes
+    return np.array_equal(here.pairs, there.pairs) and np.array_equal(here.pieces, there.pieces)
 
 
 class Margins:

@@ -554,6 +554,8 @@ class ImpactProblem:
         strikers = [robot.striker(name).model_frame for name in self.strikers]
         frames = [*strikers, *(s.frame for s in self.soles)]
         joints = [int(model.frames[model.getFrameId(name)].parentJoint) for name in frames]
+        # A hinged sole is at its foot's bottom.
+        joints += [int(model.parents[model.getJointId(s.hinge_joint)]) for s in self.soles if s.hinge]
         return Bodies(
             self.robot,
             self.world,

@@ -57,7 +57,8 @@ def solids_of(problem: ImpactProblem) -> Solids:
     number = {id(hull): k for k, hull in enumerate(hulls)}
     pairs = [(number[id(a)], number[id(b)]) for of_links in bodies.pairs.values() for a, b in of_links]
     world_number = dict[int, int]()  # of the world's bodies, among the solids
-    for w, body in enumerate(bodies.world):
+    # not those of `bodies`, which lower the ground for links that begin on it: these do not collide with it
+    for w, body in enumerate(problem.world):
         if body.ground:
             world_number[w] = FLOOR
         if body.ground or body.core:

@@ -41,6 +41,9 @@ from impactopt.bodies.convex_hulls import inertia_box, pieces_of
 from impactopt.bodies.file_shapes import lost_meshes
 from impactopt.bodies.robot_bodies import bodies_of, distance
 from impactopt.bodies.world import BEHIND, WorldBody, face_axes, ground_body, obstacle_bodies, target_bodies
+from impactopt.files.draft.drafting import draft_problem
+from impactopt.simulation.collision_geometry import FLOOR
+from impactopt.simulation.engines import solids_of
 
 Array = NDArray[np.float64]
 EXACT = 1e-6  # [m] of coal's distances
@@ -462,6 +465,29 @@ def test_a_foot_without_load_that_is_on_the_ground_at_the_start_sinks_no_deeper(
         touches = bodies.survey(np.zeros(1), places).touches
         assert [(t.one, t.other) for t in touches] == ([("right_ankle_roll", "ground")] if depth else [])
         assert [t.depth for t in touches] == pytest.approx([depth] if depth else [], abs=1e-5)
+    # its clearance from the ground is none, whatever it may sink
+    places = Places.of(robot, foot_at(-0.003)[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    survey = bodies.survey(np.zeros(1), places)
+    assert survey.nearest and "ground" not in survey.nearest
+    # nor does it collide with it in MuJoCo, where its sole does
+    solids = solids_of(dataclasses.replace(problem, start=foot_at(-0.001)))
+    with_ground = {solids.solids[one].name for one, other in solids.pairs if other == FLOOR}
+    assert "right_ankle_roll" not in with_ground and "right_knee" in with_ground
+
+
+def test_feet_on_hinged_soles_stand_on_the_ground(tmp_path: Path) -> None:
+    """The sole moves with its hinge, the foot's body with the ankle: that one collided with the ground in
+    MuJoCo from the start, and the robot fell."""
+    text = urdfs.biped(without="ankle_roll")
+    (tmp_path / "robot.urdf").write_text(text, encoding="utf-8")
+    draft = draft_problem(tmp_path / "robot.urdf", folder=tmp_path, planned=False)
+    (tmp_path / "robot.toml").write_text(draft.text, encoding="utf-8")
+    problem = load_problem(tmp_path / "robot.toml")
+    assert [sole.hinge for sole in problem.robot.soles] == ["x", "x"]
+    bodies = problem.bodies
+    on_ground = {bodies.links.name(j) for j, w in bodies.world_pairs if bodies.world[w].ground}
+    assert "left_knee_link" in on_ground
+    assert on_ground.isdisjoint({"left_ankle_pitch_link", "right_ankle_pitch_link"})
 
 
 def test_the_ground_is_what_is_below() -> None:

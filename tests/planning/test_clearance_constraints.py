@@ -11,12 +11,18 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
-from impactopt import ImpactProblem, Obstacle, Solution, Status, load_problem, solve
+from impactopt import Ground, ImpactProblem, Obstacle, Solution, Status, load_problem, solve
 from impactopt.bodies.clearance import Places
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget
-from impactopt.planning.clearance_constraints import Margins, Watch, clearance_violations, node_placements
+from impactopt.planning.clearance_constraints import (
+    Margins,
+    Watch,
+    clearance_violations,
+    node_placements,
+    same_bodies,
+)
 from impactopt.planning.refinement import Evaluation, Guess, Outcome
 from impactopt.planning.solve import PlanSolver
 from impactopt.solvers.program import max_violation
@@ -56,6 +62,26 @@ def hammer(solution: Solution, time: float) -> Array:
 
 def violation(t: Transcription, x: Array) -> float:
     return max_violation(t.program, x, t.program.constraints(x))
+
+
+def test_starts_with_other_links_on_the_ground_have_other_bodies() -> None:
+    """Their clearance constraints have the same keys for other links: a warm start ended in a KeyError."""
+    problem = load_problem("arm_planar")
+
+    def on_ground(start: list[float]) -> tuple[ImpactProblem, list[str]]:
+        def above(floor: float) -> tuple[ImpactProblem, dict[str, float]]:
+            there = dataclasses.replace(problem, start=start, ground=Ground(height=floor))
+            at = Places.of(problem.robot, np.array([start]), np.zeros(1), np.zeros(1, dtype=np.intp))
+            bodies = there.bodies
+            return there, {bodies.links.name(j): bodies.exact(at, 0, (j, -1)) for j in bodies.links.joints}
+
+        there, gaps = above(-2.0 + min(above(-2.0)[1].values()) + 1e-4)
+        return there, [name for name, gap in gaps.items() if gap <= 0]
+
+    (one, by_wrist), (other, by_elbow) = on_ground([-0.07, 2.03, 1.65]), on_ground([2.3, -1.56, 0.05])
+    assert (by_wrist, by_elbow) == (["wrist"], ["elbow"])
+    assert not same_bodies(one, other)
+    assert same_bodies(one, dataclasses.replace(one, point=one.point + np.array([0.0, 0.0, 0.01])))
 
 
 def test_bodies_that_are_near_at_the_start_may_not_penetrate_more_than_their_rounded_shapes() -> None:

@@ -133,8 +133,10 @@ class Bodies:
         self.robot, self.world, self.normal, self.striking = robot, world, normal, striking
         self.start, self.standing = start, standing
         self.links: RobotBodies = bodies_of(robot)
-        left_out = self._disabled = {frozenset(pair) for pair in robot.disable_collisions}
-        self.pairs, _ = self.links.piece_pairs(start, left_out)
+        left_out = {frozenset(pair) for pair in robot.disable_collisions}
+        self.pairs, touching = self.links.piece_pairs(start, left_out)
+        #: links that are not checked as they touch at the start, which neighbours alone should
+        self.overlaps = sorted((min(pair), max(pair)) for pair in self.links.overlaps(touching))
         at = Places.of(robot, start[None], np.zeros(1), np.zeros(1, dtype=np.intp))
         self.world_pairs: list[Pair] = []
         self._first_lowered = len(world)  # index of the first ground that is lowered for a link on it
@@ -168,11 +170,6 @@ class Bodies:
             replace(body, place=body.place + displacement) if body.of_target else body for body in self.world
         )
         return moved
-
-    @cached_property
-    def overlaps(self) -> list[tuple[str, str]]:
-        """Links that are not checked as they touch in the start posture, which neighbours alone should."""
-        return sorted((min(pair), max(pair)) for pair in self.links.overlaps(self.start, self._disabled))
 
     @cached_property
     def shapes(self) -> Shapes:

@@ -112,24 +112,26 @@ class RobotBodies:
                     out[a, b] = tuple(kept)
         return out, touching
 
-    def overlaps(self, q: Array, disabled: Iterable[frozenset[str]] = ()) -> set[frozenset[str]]:
-        """Pairs of links, no neighbours, that touch at ``q`` (nq,), but not with all joints at or near zero.
+    def overlaps(self, touching: Iterable[tuple[str, str]]) -> set[frozenset[str]]:
+        """Pairs of links of ``touching``, no neighbours, that do not touch with all joints at or near zero.
 
-        Hulls that are too large for their links touch in both.
+        Hulls that are too large for their links touch there, too.
         """
+        found = self._distant(touching)
+        return found - self._distant(self._touching_at_rest) if found else found
+
+    def _distant(self, pairs: Iterable[tuple[str, str]]) -> set[frozenset[str]]:
+        joint = {piece.link: piece.joint for piece in self.pieces}
+        supports = [set(joints) for joints in self.robot.model.supports]
+        between = ((pair, supports[joint[pair[0]]] ^ supports[joint[pair[1]]]) for pair in pairs)
+        return {frozenset(pair) for pair, joints in between if len(joints) >= NEIGHBOUR_JOINTS}
+
+    @cached_property
+    def _touching_at_rest(self) -> list[tuple[str, str]]:
         robot, rest = self.robot, neutral(self.robot.model)
         angles, step = robot.joint_positions(rest), np.zeros(robot.nv)
         step[robot.nv - robot.n :] = np.clip(angles, robot.lower, robot.upper) - angles
-        joint = {piece.link: piece.joint for piece in self.pieces}
-        supports = [set(joints) for joints in robot.model.supports]
-
-        def distant(posture: Array) -> set[frozenset[str]]:
-            _, touching = self.piece_pairs(posture, disabled)
-            between = ((pair, supports[joint[pair[0]]] ^ supports[joint[pair[1]]]) for pair in touching)
-            return {frozenset(pair) for pair, joints in between if len(joints) >= NEIGHBOUR_JOINTS}
-
-        found = distant(q)
-        return found - distant(np.asarray(pin.integrate(robot.model, rest, step))) if found else found
+        return self.piece_pairs(np.asarray(pin.integrate(robot.model, rest, step)))[1]
 
 
 _KNOWN: weakref.WeakKeyDictionary[Robot, RobotBodies] = weakref.WeakKeyDictionary()

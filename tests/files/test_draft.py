@@ -161,6 +161,17 @@ def test_knees_without_a_range_are_named_where_no_posture_is_found(tmp_path: Pat
         _drafted(tmp_path, text)
 
 
+def test_lost_meshes_of_feet_are_named_where_no_posture_is_found(tmp_path: Path) -> None:
+    # the box of a foot's inertia, which stands for its shape, is inclined sideways: without ankle roll no
+    # posture has it level
+    foot = r'(_ankle_pitch_link">.*?)<inertia [^>]*/>(.*?)<box [^>]*/>'
+    moments = 'ixx="0.002" iyy="0.004" izz="0.004" ixy="0" ixz="0" iyz="0.001"'
+    leaning = rf'\1<inertia {moments}/>\2<mesh filename="foot.stl"/>'
+    text = re.sub(foot, leaning, urdfs.biped(without="ankle_roll"), flags=re.DOTALL)
+    with pytest.raises(InputError, match=r"foot\.stl: not found; put .*; no posture with level soles"):
+        _drafted(tmp_path, text)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", ["punch", "nail"])
 def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path, motion: str) -> None:

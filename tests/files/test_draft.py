@@ -172,6 +172,13 @@ def test_lost_meshes_of_feet_are_named_where_no_posture_is_found(tmp_path: Path)
         _drafted(tmp_path, text)
 
 
+def test_a_robot_whose_knees_point_back_has_its_right_foot_on_its_right(tmp_path: Path) -> None:
+    knee = r'(<joint name="[^"]*knee".*?)lower="[^"]*" upper="[^"]*"'
+    text = re.sub(knee, r'\1lower="-2.2" upper="0"', urdfs.biped(arms=False), flags=re.DOTALL)
+    kick = read_toml(_drafted(tmp_path, text, motion="kick").text)["problem"]
+    assert kick["striker"] == "right_toe" and kick["point_m"][1] < 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", ["punch", "nail"])
 def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path, motion: str) -> None:

@@ -179,6 +179,18 @@ def test_a_robot_whose_knees_point_back_has_its_right_foot_on_its_right(tmp_path
     assert kick["striker"] == "right_toe" and kick["point_m"][1] < 0
 
 
+def test_a_kick_in_place_of_a_punch_is_told_with_the_reason(tmp_path: Path) -> None:
+    text = urdfs.biped()
+    for joint, low, high in (("shoulder_pitch", 1.2, 2.8), ("elbow", -0.2, 0.0)):  # arms stay behind
+        limits = rf'(<joint name="[^"]*{joint}".*?)lower="[^"]*" upper="[^"]*"'
+        text = re.sub(limits, rf'\1lower="{low}" upper="{high}"', text, flags=re.DOTALL)
+    with pytest.raises(InputError) as no_punch:
+        _drafted(tmp_path, text, motion="punch")
+    draft = _drafted(tmp_path, text)
+    assert read_toml(draft.text)["problem"]["striker"] == "right_toe"
+    assert draft.said[-1] == f"a kick is drafted, as there is no punch: {no_punch.value}"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", ["punch", "nail"])
 def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path, motion: str) -> None:

@@ -147,9 +147,10 @@ def _of_motion(
         if motion == "punch":
             raise
         try:
-            return _kick(drafted, soles, strikers, forward, folder)
+            kick = _kick(drafted, soles, strikers, forward, folder)
         except InputError:
             raise no_punch from None
+        return replace(kick, said=(*kick.said, f"a kick is drafted, as there is no punch: {no_punch}"))
 
 
 def _standing(

@@ -28,6 +28,9 @@ CORNER_RADIUS = 0.005  # [m] of the spheres at a sole's corners; they touch the 
 # of a link without mass, as MuJoCo has no moving body without: a microgram, which moves nothing
 MASSLESS = pin.Inertia.FromSphere(1e-9, 0.05)
 MAX_DISTANCE = 0.05  # [m] between link and target; larger distances are not computed
+# least integral of x^2 dm along a principal axis of a body, over the largest: more than the rounding of an
+# exported scene
+MIN_SECOND_MOMENT = 1e-5
 
 
 @dataclass(frozen=True)
@@ -345,6 +348,13 @@ def _inertial(body: Any, mass: float, centre: Any, inertia: Any) -> None:
     body.explicitinertial = True
     body.mass = float(mass)
     body.ipos = centre
+    moments, axes = np.linalg.eigh(inertia)
+    second = moments.sum() / 2 - moments  # integrals of x^2 dm along the principal axes
+    least = MIN_SECOND_MOMENT * second.max()
+    # MuJoCo refuses plates and rods without thickness, and their rounded decimals, which a robot may have
+    if second.min() < least:
+        second = np.maximum(second, least)
+        inertia = axes @ np.diag(second.sum() - second) @ axes.T
     i = np.asarray(inertia)
     body.fullinertia = [i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]
 

@@ -185,6 +185,36 @@ def test_knees_without_a_range_are_named_where_no_posture_is_found(tmp_path: Pat
         _drafted(tmp_path, text)
 
 
+def test_lost_meshes_of_feet_are_named_where_no_posture_is_found(tmp_path: Path) -> None:
+    # the box of a foot's inertia, which stands for its shape, is inclined sideways: without ankle roll no
+    # posture has it level
+    foot = r'(_ankle_pitch_link">.*?)<inertia [^>]*/>(.*?)<box [^>]*/>'
+    moments = 'ixx="0.002" iyy="0.004" izz="0.004" ixy="0" ixz="0" iyz="0.001"'
+    leaning = rf'\1<inertia {moments}/>\2<mesh filename="foot.stl"/>'
+    text = re.sub(foot, leaning, urdfs.biped(without="ankle_roll"), flags=re.DOTALL)
+    with pytest.raises(InputError, match=r"foot\.stl: not found; put .*; no posture with level soles"):
+        _drafted(tmp_path, text)
+
+
+def test_a_robot_whose_knees_point_back_has_its_right_foot_on_its_right(tmp_path: Path) -> None:
+    knee = r'(<joint name="[^"]*knee".*?)lower="[^"]*" upper="[^"]*"'
+    text = re.sub(knee, r'\1lower="-2.2" upper="0"', urdfs.biped(arms=False), flags=re.DOTALL)
+    kick = read_toml(_drafted(tmp_path, text, motion="kick").text)["problem"]
+    assert kick["striker"] == "right_toe" and kick["point_m"][1] < 0
+
+
+def test_a_kick_in_place_of_a_punch_is_told_with_the_reason(tmp_path: Path) -> None:
+    text = urdfs.biped()
+    for joint, low, high in (("shoulder_pitch", 1.2, 2.8), ("elbow", -0.2, 0.0)):  # arms stay behind
+        limits = rf'(<joint name="[^"]*{joint}".*?)lower="[^"]*" upper="[^"]*"'
+        text = re.sub(limits, rf'\1lower="{low}" upper="{high}"', text, flags=re.DOTALL)
+    with pytest.raises(InputError) as no_punch:
+        _drafted(tmp_path, text, motion="punch")
+    draft = _drafted(tmp_path, text)
+    assert read_toml(draft.text)["problem"]["striker"] == "right_toe"
+    assert draft.said[-1] == f"a kick is drafted, as there is no punch: {no_punch.value}"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", ["punch", "nail"])
 def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path, motion: str) -> None:

@@ -202,6 +202,24 @@ def test_inertia_and_bias_are_pinocchios(name: str, worlds: dict[str, _Replay]) 
         np.testing.assert_allclose(replay.data.qfrc_bias[order], bias, atol=1e-8 * np.abs(bias).max())
 
 
+@pytest.mark.parametrize(
+    "moments",
+    [(0.1, 0.2, 0.3), (0.1, 0.2, 0.30009), (3e-20, 0.2, 0.2)],
+    ids=["plate", "rounded plate", "rod"],
+)
+def test_a_link_without_thickness_has_its_inertia(moments: tuple[float, ...]) -> None:
+    """Rounding breaks the triangle inequality, or decimals do, within the tolerance that robots have."""
+    robot = arm()
+    turn = pin.exp3(np.array([0.3, -0.5, 0.9]))
+    own = turn @ np.diag(moments) @ turn.T
+    robot.model.inertias[2] = pin.Inertia(2.0, np.array([0.0, 0.0, 0.2]), own)
+    world = build_world(robot, scene("striker:hand"), Perturbation(), MujocoOptions())
+    there = world.body(f"body {robot.model.names[2]}")
+    rotation = pin.Quaternion(np.roll(there.iquat, -1)).toRotationMatrix()
+    found = rotation @ np.diag(there.inertia) @ rotation.T
+    np.testing.assert_allclose(found, own, atol=5e-4 * max(moments))
+
+
 # ---- standing
 
 

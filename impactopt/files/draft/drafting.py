@@ -111,8 +111,8 @@ def draft_problem(
     try:
         return _of_motion(drafted, motion, folder, say, planned=planned)
     except InputError as error:
-        # the reason, where a robot of that size or with such limits has no posture
-        causes = [*unit_doubts(drafted.robot)]
+        # the reason, where a robot of that size, with such shapes or limits has no sole or posture
+        causes = [*unit_doubts(drafted.robot), *shape_doubts(drafted.robot)]
         if fixed := sorted(joint for joint, why in drafted.locked.items() if why == NO_RANGE):
             causes.append(f"joints without a range, locked: {', '.join(fixed)}")
         if not causes:
@@ -147,9 +147,10 @@ def _of_motion(
         if motion == "punch":
             raise
         try:
-            return _kick(drafted, soles, strikers, forward, folder)
+            kick = _kick(drafted, soles, strikers, forward, folder)
         except InputError:
             raise no_punch from None
+        return replace(kick, said=(*kick.said, f"a kick is drafted, as there is no punch: {no_punch}"))
 
 
 def _standing(

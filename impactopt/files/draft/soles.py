@@ -91,7 +91,8 @@ def find_soles(
 
 
 def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> Array:
-    """Forward direction (3,), an axis of the root: that in which the knees point, else that of the feet.
+    """Forward direction (3,), an axis of the root: ahead of feet named left and right, else that in which the
+    knees point, else that of the feet.
 
     feet (3,) [m] : sum of the horizontal vectors from the ankles to the centres of the feet.
     """
@@ -112,7 +113,11 @@ def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> 
         axis, shin = jac[3:, knee.idx_v], ankle - data.oMi[index].translation
         if knee.nq == 1 and abs(low + high) > BENDS:
             back += np.sign(low + high) * np.cross(axis, shin) * [1.0, 1.0, 0.0]
-    for way in (-back, feet):
+    spots = {_side(first_link(model, leg.tip)[0]): data.oMi[leg.tip].translation for leg in legs}
+    named = np.zeros(3)
+    if spots.keys() == {"left", "right"}:  # before the knees, as those of some robots point back
+        named = np.cross(spots["left"] - spots["right"], [0.0, 0.0, 1.0])
+    for way in (named, -back, feet):
         if np.abs(way).max() > AHEAD * len(legs):
             k = int(np.argmax(np.abs(way)))
             return np.asarray(np.eye(3)[k] * np.sign(way[k]))

@@ -122,3 +122,5 @@ def _done(solution: Solution, job: str) -> Any:
         return solution.validate(engine=job)
     except InputError as error:
         return str(error)
+    except Exception as error:  # whatever fails after the plan, the plan is kept
+        return f"{type(error).__name__}: {error}"

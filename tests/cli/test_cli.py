@@ -256,6 +256,20 @@ def test_a_plan_outlives_the_processes_that_replay_it(
     assert summary["baseline"] == {"method": "minimum jerk", "error": told}
 
 
+def test_a_plan_outlives_a_replay_that_breaks_down(
+    planner: Planner, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Results were written after the replays, so an engine's own error lost the plan."""
+
+    def broken(self: Solution, *, engine: str, **options: Any) -> Any:
+        raise ValueError(f"{engine} accepts no such body")
+
+    monkeypatch.setattr(FakeSolution, "validate", broken)
+    _, err = run("solve", file, "--out", tmp_path / "out")
+    assert "ValueError: mujoco accepts no such body" in err
+    assert load_record(tmp_path / "out").summary["impulse_Ns"] > 0
+
+
 def test_the_files_solver_settings_reach_the_solver(planner: Planner, file: Path, tmp_path: Path) -> None:
     run("solve", file, "--out", tmp_path / "out")
     assert (planner.options["solver"], planner.options["time_limit"]) == ("ipopt", 40)

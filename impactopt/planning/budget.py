@@ -257,7 +257,7 @@ def touching(result: SolverResult, depth: float, names: Iterable[str], what: str
     """
     pairs = "; ".join(sorted(set(names))[:3])
     found = f"no {what} was found in which they do not"
-    message = f"Bodies penetrate each other by {1e3 * depth:.1f} mm, and {found}: {pairs}."
+    message = f"Bodies penetrate each other by {1e3 * depth:.2g} mm, and {found}: {pairs}."
     # Above VIOLATED however shallow, as `Outcome.refused` compares with it.
     worst = max(result.max_violation, depth, 2 * VIOLATED)
     return replace(result, status=Status.FAILED, max_violation=worst, message=message)

@@ -237,7 +237,7 @@ def _leg(
         names = [model.names[j] for j in joints]
         raise InputError(
             f"no posture with level soles is found for the leg {', '.join(map(str, names))}: the best one is"
-            f" {nearest:.2g} off; give postures by hand (docs/howto/robot.md)"
+            f" {nearest:.2g} m or rad off; give postures by hand (docs/howto/robot.md)"
         )
     return _set(robot, q, own, best[1])
 

@@ -454,7 +454,7 @@ def meets_again(target: Target, collision: Collision) -> str:
 
     They slow down after the touch, which ends as soon as they are ahead of the striker.
     """
-    if not target.met_again or collision.target_result.get("broken"):
+    if not (target.met_again and collision.separated) or collision.target_result.get("broken"):
         return ""
     before, *_, after = collision.hand_speed - float(target.speed_before())
     if not after > _STILL_APPROACHES * before:

@@ -110,7 +110,7 @@ def sticks_out(problem: ImpactProblem) -> list[str]:
 
 
 def overlapping(problem: ImpactProblem) -> str:
-    """Message about links, no neighbours, that touch at the start and so are not kept apart; else ""."""
+    """Message about links, no neighbours, that touch at the start and so need no clearance; else ""."""
     pairs = problem.bodies.overlaps if problem.self_collision.enabled else []
     if not pairs:
         return ""

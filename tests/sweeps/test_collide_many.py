@@ -20,6 +20,8 @@ from impactopt import (
     Free,
     FreeMass,
     InputError,
+    KelvinVoigt,
+    Nail,
     Robot,
     SpringDamper,
     collide_many,
@@ -30,7 +32,7 @@ from impactopt import (
     striking_velocity,
 )
 from impactopt.collide.contact_states import ContactStates, Posture
-from impactopt.collide.single_collision import collide_once
+from impactopt.collide.single_collision import collide_once, meets_again
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.files.sections.reading import CollisionFile
@@ -205,6 +207,18 @@ def test_a_nail_that_is_touched_again_is_told(stiffness: float, again: bool) -> 
         assert driven > 2 * first
     else:
         assert driven == pytest.approx(first, rel=0.01)
+
+
+def test_a_contact_that_has_not_ended_is_not_touched_again() -> None:
+    """The live page shows such contacts; their striker still moves with the nail."""
+    robot, nail = load_robot("planar_arm"), Nail(mass=0.05, resistance=600.0)
+    q = robot.posture("ready")
+    v = striking_velocity(robot, q, "hammer", NORMAL, 3.0)
+    law = KelvinVoigt(stiffness=1e5, damping=20.0)
+    model = SDC(robot=robot, striker="hammer", normal=NORMAL, law=law, target=nail, horizon=2e-3)
+    found = model.collide(q, v, holding_torque(robot, q, v), require_separation=False)
+    assert not found.separated and found.hand_speed[-1] > 1.0
+    assert not meets_again(nail, found)
 
 
 def test_a_floating_robot_that_has_momentum_is_told() -> None:

@@ -151,8 +151,10 @@ def finer(model: CollisionModel, durations: Array) -> Iterator[tuple[CollisionMo
 
     There are none for contacts in which the model itself has so many.
     """
-    if not isinstance(model, SymbolicModel) or model.stepping != "implicit":
-        return  # full dynamics have more, Runge-Kutta's steps resolve the contact, an impact takes no time
+    # Full dynamics have more, Runge-Kutta's steps resolve the contact, an impact takes no time, and a point
+    # mass has no histories.
+    if not isinstance(model, SymbolicModel) or model.stepping != "implicit" or not model.n_servos:
+        return
     # powers of ten, as compiled functions depend on the step
     with np.errstate(divide="ignore", invalid="ignore"):
         powers = np.floor(np.log10(durations / _INSTANTS))

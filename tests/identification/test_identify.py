@@ -462,6 +462,7 @@ def test_neither_a_round_top_nor_a_coarse_converter_is_taken_for_a_cut(step: flo
     assert identify(dataclasses.replace(log, force=force), laws=["Kelvin-Voigt"]).clipped == (0,)
 
 
+@pytest.mark.slow
 def test_the_round_top_of_a_dense_log_is_not_taken_for_a_cut() -> None:
     """500 samples a millisecond, without noise: near its top the half sine hardly changes."""
     k, begin, period = 1e4, 0.02, np.pi * np.sqrt(MASS / 1e4)

@@ -115,6 +115,7 @@ def unused_in_figure(figure: Figure) -> list[Mistake]:
 
 
 AtLeastOne = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, le=10_000_000)]  # of values, which are kept in memory
 Seed = Annotated[int, Field(ge=0)]
 
 
@@ -148,7 +149,7 @@ class SpanSection(Section):
 
     first: float = required("the first", "from")
     last: float = required("the last, included", "to")
-    count: AtLeastOne | None = optional("number of values; not for drawn ones")
+    count: Count | None = optional("number of values; not for drawn ones")
     scale: Literal["linear", "log"] = Field(
         default="linear", description="equal steps (linear) or equal factors (log)"
     )
@@ -160,7 +161,7 @@ class DrawSection(Section):
     method: Literal["random", "sobol", "latin hypercube"] = Field(
         default="sobol", description="method of drawing"
     )
-    count: AtLeastOne = required("number of points")
+    count: Count = required("number of points")
     over: dict[str, Any] = required("by key path, a range or a list to choose from")
 
 

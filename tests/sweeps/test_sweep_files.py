@@ -200,6 +200,8 @@ def test_keys_and_values_are_the_problem_files(tmp_path: Path) -> None:
         ),
         ("[list]\ncontact.stiffness = 3", "[list] contact.stiffness: 3; give a list of values"),
         ("[draw]\ncount = 3\n[draw.over]\n", "[draw.over]: empty"),
+        ("[list]\ntarget.resistance = {from = 1.0, to = 2.0, count = 1000000000}", "10000000"),
+        ("[draw]\ncount = 1000000000\nover.target.resistance = {from = 1.0, to = 3.0}", "10000000"),
         (
             "[draw]\ncount = 3\nover.target.resistance = {from = -1.0, to = 3.0}",
             "[draw.over] target.resistance: with",

@@ -112,7 +112,10 @@ class Closest(NamedTuple):
 
 
 class Bodies:
-    """Bodies of a scene, and their pairs that must not touch."""
+    """Bodies of a scene, and their pairs that must not touch.
+
+    overlaps : links that are not checked as they touch at the start, which neighbours alone should.
+    """
 
     def __init__(
         self,
@@ -135,7 +138,6 @@ class Bodies:
         self.links: RobotBodies = bodies_of(robot)
         left_out = {frozenset(pair) for pair in robot.disable_collisions}
         self.pairs, touching = self.links.piece_pairs(start, left_out)
-        #: links that are not checked as they touch at the start, which neighbours alone should
         self.overlaps = sorted((min(pair), max(pair)) for pair in self.links.overlaps(touching))
         at = Places.of(robot, start[None], np.zeros(1), np.zeros(1, dtype=np.intp))
         self.world_pairs: list[Pair] = []

@@ -76,6 +76,15 @@ class RobotBodies:
         """Name of the body that a joint moves, for messages: its largest link."""
         return self._names[joint]
 
+    def joints_between(self, one: int, other: int) -> int:
+        """Number of joints on the path in the tree between the bodies that two joints move."""
+        return len(self._chains[one] ^ self._chains[other])
+
+    @cached_property
+    def _chains(self) -> list[set[int]]:
+        """Joints from the root to each joint."""
+        return [set(joints) for joints in self.robot.model.supports]
+
     def piece_pairs(
         self, q: Array, disabled: Iterable[frozenset[str]] = ()
     ) -> tuple[dict[Pair, tuple[tuple[Piece, Piece], ...]], list[tuple[str, str]]]:
@@ -122,16 +131,17 @@ class RobotBodies:
 
     def _distant(self, pairs: Iterable[tuple[str, str]]) -> set[frozenset[str]]:
         joint = {piece.link: piece.joint for piece in self.pieces}
-        supports = [set(joints) for joints in self.robot.model.supports]
-        between = ((pair, supports[joint[pair[0]]] ^ supports[joint[pair[1]]]) for pair in pairs)
-        return {frozenset(pair) for pair, joints in between if len(joints) >= NEIGHBOUR_JOINTS}
+        return {
+            frozenset((one, two))
+            for one, two in pairs
+            if self.joints_between(joint[one], joint[two]) >= NEIGHBOUR_JOINTS
+        }
 
     @cached_property
     def _touching_at_rest(self) -> list[tuple[str, str]]:
         robot, rest = self.robot, neutral(self.robot.model)
-        angles, step = robot.joint_positions(rest), np.zeros(robot.nv)
-        step[robot.nv - robot.n :] = np.clip(angles, robot.lower, robot.upper) - angles
-        return self.piece_pairs(np.asarray(pin.integrate(robot.model, rest, step)))[1]
+        angles = np.clip(robot.joint_positions(rest), robot.lower, robot.upper)
+        return self.piece_pairs(robot.angles.put(rest, angles))[1]
 
 
 _KNOWN: weakref.WeakKeyDictionary[Robot, RobotBodies] = weakref.WeakKeyDictionary()

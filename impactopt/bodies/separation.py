@@ -138,11 +138,8 @@ class Shapes:
         self.hulls = np.array(hulls, dtype=np.int64).reshape(-1, 4)
         self.radius = np.array(radius, dtype=float)
         self.pieces = np.array(pieces_of, dtype=np.int64).reshape(-1, 2)
-        # Joints from the root to each; those of only one of the two are between them.
-        supports = [set(joints) for joints in links.robot.model.supports]
-        self.between = np.array(
-            [len(supports[a] ^ supports[b]) if b >= 0 else len(supports) for a, b in pairs]
-        )
+        everything = links.robot.model.njoints  # a body of the world is no neighbour
+        self.between = np.array([links.joints_between(a, b) if b >= 0 else everything for a, b in pairs])
         self.index = {(a, b, k): n for n, ((a, b), k) in enumerate(zip(pairs, number, strict=True))}
 
     def __len__(self) -> int:

@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from impactopt.bodies.file_shapes import Geom, LinkShape, geoms_of, lost_meshes, shapes_of
 from impactopt.bodies.solids import Solid, cached_arrays, cylinder, rounded_box
+from impactopt.robots.model import principal_moments
 from impactopt.robots.robot import Robot, Tool
 from impactopt.robots.tools import without
 
@@ -191,10 +192,8 @@ def inertia_box(inertia: Any) -> Solid:
 
 def inertia_sides(inertia: Any) -> tuple[Array, Array]:
     """Sides (3,) [m] and axes (3, 3) of the box that has a mass and an inertia."""
-    moments, axes = np.linalg.eigh(np.array(inertia.inertia))
-    # With sides a, b, c the moments are m (b^2 + c^2) / 12 and so on: their sum less
-    # twice the first gives a^2.
-    squares = 6.0 / inertia.mass * (moments.sum() - 2 * moments)
+    _, second, axes = principal_moments(inertia.inertia)
+    squares = 12.0 / inertia.mass * second  # along a side a the second moment is m a^2 / 12
     # eigh's axes may be left-handed, and a reflection would turn the solid inside out.
     axes = axes if np.linalg.det(axes) > 0 else -axes
     return np.sqrt(np.maximum(squares, _SHORTEST_SIDE**2)), axes

@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, counted, did_you_mean
-from impactopt.robots.model import mass_matrix
+from impactopt.robots.model import mass_matrix, principal_moments
 
 _MARK = "\x00"  # no name in a file contains it
 
@@ -453,10 +453,7 @@ def repair_inertias(model: pin.Model) -> list[str]:
         body = model.inertias[i]
         if not (0 < body.mass <= HEAVIEST and np.isfinite(np.array(body.inertia)).all()):
             continue  # without a mass nothing can be repaired: `check_inertias` refuses it
-        moments, axes = np.linalg.eigh(np.array(body.inertia))
-        # Integrals of x^2 dm along the principal axes. Those of a body are positive, which is the triangle
-        # inequality of its moments of inertia.
-        second = moments.sum() / 2 - moments
+        moments, second, axes = principal_moments(body.inertia)
         least = body.mass * MIN_THICKNESS**2 / 12
         ball = bool((second < least).all()) or moments[2] > largest
         if not ball and moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - TRIANGLE_TOLERANCE):

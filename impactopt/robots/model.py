@@ -45,6 +45,16 @@ class JointAngles:
         return q
 
 
+def principal_moments(inertia: ArrayLike) -> tuple[Array, Array, Array]:
+    """Moments of an inertia (3, 3) [kg m2], second moments of mass, and the principal axes (3, 3) as columns.
+
+    The second moments (3,) are the integrals of x^2 dm along the axes. Those of a body are positive, which is
+    the triangle inequality of its moments of inertia; each of these is the sum of the other two axes'.
+    """
+    moments, axes = np.linalg.eigh(np.asarray(inertia))
+    return moments, moments.sum() / 2 - moments, axes
+
+
 def mass_matrix(model: pin.Model, data: Any, q: Array) -> Array:
     """H (nv, nv), symmetric, at q (nq), with armature on its diagonal, by `pin.crba`.
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError, missing_package
 from impactopt.robots.couplings import axis_of
+from impactopt.robots.model import principal_moments
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
@@ -28,8 +29,7 @@ CORNER_RADIUS = 0.005  # [m] of the spheres at a sole's corners; they touch the 
 # of a link without mass, as MuJoCo has no moving body without: a microgram, which moves nothing
 MASSLESS = pin.Inertia.FromSphere(1e-9, 0.05)
 MAX_DISTANCE = 0.05  # [m] between link and target; larger distances are not computed
-# least integral of x^2 dm along a principal axis of a body, over the largest: more than the rounding of an
-# exported scene
+# least second moment of mass of a body, over its largest: more than the rounding of an exported scene
 MIN_SECOND_MOMENT = 1e-5
 
 
@@ -348,8 +348,7 @@ def _inertial(body: Any, mass: float, centre: Any, inertia: Any) -> None:
     body.explicitinertial = True
     body.mass = float(mass)
     body.ipos = centre
-    moments, axes = np.linalg.eigh(inertia)
-    second = moments.sum() / 2 - moments  # integrals of x^2 dm along the principal axes
+    _, second, axes = principal_moments(inertia)
     least = MIN_SECOND_MOMENT * second.max()
     # MuJoCo refuses plates and rods without thickness, and their rounded decimals, which a robot may have
     if second.min() < least:

@@ -393,9 +393,9 @@ def collide_once(
     """
     section, content = check_at_contact(at_contact), file.content
     record = None if section.result is None else load_record(section.result)
-    # a horizon of the caller's may be shorter than the saved contact
-    misplaced = section.result is not None and "horizon" not in section.model_fields_set and section.freezes
-    if record is not None and "horizon" not in section.model_fields_set:
+    # A horizon of the caller's may be shorter than the saved contact.
+    extended = record is not None and "horizon" not in section.model_fields_set
+    if record is not None and extended:
         section = section.model_copy(update={"horizon": _horizon(record, section.horizon)})
     robot = content.make_robot(file.path.parent)
     striker, (stance, start) = content.problem.striker, content.stance_at_impact(robot)
@@ -419,7 +419,7 @@ def collide_once(
     for resolving, _ in finer(model, np.array([collision.duration])):
         collision = _collide(resolving, state, section)
     if not collision.separated:
-        return {**head, "reason": _CONTACT_DOES_NOT_END if misplaced else NOT_ENDED}
+        return {**head, "reason": _CONTACT_DOES_NOT_END if extended and section.freezes else NOT_ENDED}
     found: dict[str, Any] = {}
     for name in dict.fromkeys(name for m in MEASURES.values() for name in m.outputs):
         value = getattr(collision, name)

@@ -280,13 +280,13 @@ class MeasuredImpact:
         return float(self.force.max())
 
 
-def _clipped(force: Array) -> NDArray[np.bool_]:
-    """Mask (k,) of the samples of a log whose force is cut off: those at a flat top."""
+def _clipped(force: Array, noise: float) -> NDArray[np.bool_]:
+    """Mask (k,) of the samples of a log whose force is cut off: those at a flat top; noise : of the force."""
     top = float(force.max())
-    at_top = force >= top - max(_NOISE_FRACTION * noise_of(force), _PEAK_FRACTION * top)
+    at_top = force >= top - max(_NOISE_FRACTION * noise, _PEAK_FRACTION * top)
     step = float(np.diff(np.unique(force)).min(initial=np.inf))
     # noise that many steps of a converter are in leaves no equal samples at a top that is not cut off
-    if np.sum(force >= top * (1 - _PEAK_FRACTION)) >= _FLAT_SAMPLES and noise_of(force) > _NOISE_STEPS * step:
+    if np.sum(force >= top * (1 - _PEAK_FRACTION)) >= _FLAT_SAMPLES and noise > _NOISE_STEPS * step:
         return at_top
     for begin, end in np.flatnonzero(np.diff(np.concatenate([[0], at_top, [0]]))).reshape(-1, 2):
         beyond = (end - begin) // 2
@@ -331,7 +331,7 @@ def find_impacts(log: ImpactLog) -> tuple[tuple[MeasuredImpact, ...], tuple[floa
     # noise alone lifts a few samples of a long log, or of the end of a contact, above that
     loud = [(b, e) for b, e in spans if e - b >= _MIN_SAMPLES or log.force[b:e].max() > 8 * noise]
     spans = loud or spans
-    clipped = _clipped(log.force)
+    clipped = _clipped(log.force, noise)
     weak = tuple(
         float(log.time[begin])
         for begin, end in _spans(log.force, max(_MIN_REPORTED * peak, 8 * noise))

@@ -144,12 +144,18 @@ def phase_rows(sources: Sequence[Mapping[str, Any]], phases: Iterable[str]) -> I
             yield number_row(f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
 
 
+# numbers of a collision that have a limit, or are per cent of the impulse: less than a digit is none
+_COARSE = ("freeze_error_pct", "zmp_margin_m", "sole_force_N", "torque_ratio", "velocity_ratio")
+
+
 def collision_rows(found: Mapping[str, Any]) -> list[Row]:
     """Rows of one collision and those of a saved result; `found` as in `impactopt collide --json`."""
-    sources = [dict(x) for x in (found, *(found.get("saved") or {}).values())]
-    most_uncertain = -np.inf if found.get("caution") else np.inf
     # null: at some instant the ground carries no load, or would have to pull
-    sources = [x | {"zmp_margin_m": -np.inf} if x.get("zmp_margin_m", 0) is None else x for x in sources]
+    sources: list[Mapping[str, Any]] = [
+        {key: -np.inf if key == "zmp_margin_m" and value is None else value for key, value in source.items()}
+        for source in (found, *(found.get("saved") or {}).values())
+    ]
+    most_uncertain = -np.inf if found.get("caution") else np.inf
     rows = [
         number_row(
             label,
@@ -158,7 +164,7 @@ def collision_rows(found: Mapping[str, Any]) -> list[Row]:
             scale=scale,
             least=least,
             most=most,
-            small=least < 0 and key != "freeze_error_pct",
+            small=key not in _COARSE,
         )
         for label, key, digits, scale, least, most in (
             ("speed at contact [m/s]", "hand_speed_m_s", 3, 1.0, -np.inf, np.inf),

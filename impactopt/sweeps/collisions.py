@@ -196,11 +196,17 @@ class CollisionBatch:
 
     @cached_property
     def _outputs(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(name for m in self.measures.values() for name in m.outputs))
+        needed = [name for m in self.measures.values() for name in m.outputs]
+        # which tells if histories need shorter steps
+        return tuple(dict.fromkeys([*needed, "duration"] if self._has_histories else needed))
+
+    @cached_property
+    def _has_histories(self) -> bool:
+        return any(name in HISTORIES for m in self.measures.values() for name in m.outputs)
 
     @cached_property
     def _max_batch(self) -> int:
-        return _MAX_BATCH_HISTORIES if {*self._outputs} & {*HISTORIES} else _MAX_BATCH
+        return _MAX_BATCH_HISTORIES if self._has_histories else _MAX_BATCH
 
     def _collide(
         self, posture: Posture, numbers: Numbers, count: int, threads: int | None
@@ -225,13 +231,12 @@ class CollisionBatch:
         states = states.some(good)
         settings = {name: x[good] if len(x) == count else x for name, x in settings.items()}
         settings |= states.reference_settings
-        values, durations = self._measured(model, states, settings, posture, threads)
-        if {*self._outputs} & {*HISTORIES}:
-            for resolving, some in finer(model, durations):
-                theirs = {name: x[some] if len(x) == len(good) else x for name, x in settings.items()}
-                better, _ = self._measured(resolving, states.some(some), theirs, posture, threads)
-                for name, x in better.items():
-                    values[name][some] = x
+        values, found = self._measured(model, states, settings, posture, threads)
+        for resolving, some in finer(model, found["duration"]) if self._has_histories else ():
+            theirs = {name: x[some] if len(x) == len(good) else x for name, x in settings.items()}
+            better, _ = self._measured(resolving, states.some(some), theirs, posture, threads)
+            for name, x in better.items():
+                values[name][some] = x
         for name, x in values.items():
             out[name][good] = x
         return out
@@ -243,16 +248,15 @@ class CollisionBatch:
         settings: Mapping[str, Array],
         posture: Posture,
         threads: int | None,
-    ) -> tuple[dict[str, NDArray[Any]], Array]:
-        """Values (count,) as of `__call__` for states at contact, and durations (count,) [s] of contacts."""
+    ) -> tuple[dict[str, NDArray[Any]], Mapping[str, Array]]:
+        """Values (count,) as of `__call__` for states at contact, and the model's outputs."""
         # a point mass has no servo, and the paper's SDC no stiffness
         known = getattr(model, "settings", settings)
         given = {name: x for name, x in settings.items() if name in known}
-        outputs = tuple(dict.fromkeys((*self._outputs, "duration")))
         if isinstance(model, SymbolicModel):
-            found, reason = batch(model, outputs, states, given, threads)
+            found, reason = batch(model, self._outputs, states, given, threads)
         else:
-            found, reason = one_by_one(model, outputs, states, given)
+            found, reason = one_by_one(model, self._outputs, states, given)
         collisions = CollisionResults(
             found=found,
             states=states,
@@ -264,7 +268,7 @@ class CollisionBatch:
             name: np.where(reason == "", measure.of(collisions), np.nan)
             for name, measure in self.measures.items()
         }
-        return {**values, "reason": reason}, found["duration"]
+        return {**values, "reason": reason}, found
 
     def _settings(self, numbers: Numbers) -> dict[str, Array]:
         """Parameters of law, target and servo by their names in `Settings`, (count, ...) or (1, ...)."""

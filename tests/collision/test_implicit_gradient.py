@@ -83,6 +83,7 @@ ARMS = {
 }
 
 
+@pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("name", ARMS)
 def test_an_arms_gradient_is_that_of_exact_collisions(name):
     outputs, options = ARMS[name]

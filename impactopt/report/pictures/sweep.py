@@ -211,7 +211,7 @@ def _legend(figure: Picture, handles: Sequence[Any], labels: Sequence[str], titl
 
 def _shaded(section: Section, data: SweepColumns) -> bool:
     """True if lines have the shades of one number."""
-    return len(section.colour) == 1 and data.values(section.colour[0]).dtype != object
+    return len(section.colour) == 1 and data.is_numeric(section.colour[0])
 
 
 def _shades(
@@ -242,7 +242,7 @@ def _scatter(section: Section, data: SweepColumns) -> Picture:
         drawn = np.random.default_rng(0).permutation(drawn)[:MAX_POINTS]
     size = 22.0 if len(drawn) < 500 else 9.0 if len(drawn) < 5000 else 3.0
     colour = section.colour[0] if section.colour else None
-    numeric = colour is not None and data.values(colour).dtype != object
+    numeric = colour is not None and data.is_numeric(colour)
     norm: Any = None
     if numeric and colour is not None:
         scale, least = (LogNorm, 0.0) if "colour" in section.log else (Normalize, -np.inf)
@@ -251,11 +251,12 @@ def _scatter(section: Section, data: SweepColumns) -> Picture:
         norm = scale(levels.min(), levels.max()) if len(levels) else scale(0.1, 1.0)
     groups, names = combined(section.colour[:1] if not numeric else [], data)
     marks: Any = None
+    paints = _colours(len(names))
     for k, (axes, title) in enumerate(zip(grid, titles, strict=True)):
         own = drawn[panel[drawn] == k]
         for g, series in enumerate(names):
             some = own[groups[own] == g]
-            paint: dict[str, Any] = {"color": _colours(len(names))[g], "label": series}
+            paint: dict[str, Any] = {"color": paints[g], "label": series}
             if numeric and colour is not None:
                 paint = {"c": data.numbers(colour)[some], "cmap": SCALE, "norm": norm}
             marks = axes.scatter(x[some], y[some], s=size, edgecolors="none", rasterized=True, **paint)

@@ -41,6 +41,10 @@ class SweepColumns:
                 return np.array(["" if x is None else str(x) for x in raw], dtype=object)
         return np.array(raw, dtype=np.float64)
 
+    def is_numeric(self, name: str) -> bool:
+        """True for a column of numbers, False for one of texts."""
+        return self.values(name).dtype != object
+
     def numbers(self, name: str) -> Array:
         """Numbers of a column.
 

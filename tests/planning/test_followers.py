@@ -12,46 +12,23 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from support import urdfs
+from support.problem_texts import bolted_arm
 from typer.testing import CliRunner
 
 from impactopt import Solution, Status, load_problem, solve
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
 
-PROBLEM = """
-[problem]
-name = "parallelogram"
-striker = "hand"
-start = "ready"
-point_m = [0.55, 0.22, 0.465]
-normal = [0.0, 0.0, -1.0]
-
-[robot]
-urdf = "robot.urdf"
-floating = false
-armature_kg_m2 = 0.05
-
-[robot.locked_rad]
-slide_0 = 0.0
-slide_1 = 0.0
-
-[[robot.strikers]]
-name = "hand"
-frame = "wrist_link"
-point_m = [0.0, 0.0, 0.15]
-
-[robot.postures_rad.ready]
-turn = 0.385
-shoulder = 1.05
-elbow = -0.25
-
-[target]
-mass_kg = 1.0
-
-[contact]
-stiffness_N_m = 1e4
-damping_N_s_m = 100.0
-"""
+PROBLEM = bolted_arm(
+    name="parallelogram",
+    frame="wrist_link",
+    tip=[0.0, 0.0, 0.15],
+    point=[0.55, 0.22, 0.465],
+    normal=[0.0, 0.0, -1.0],
+    start="ready",
+    postures={"ready": {"turn": 0.385, "shoulder": 1.05, "elbow": -0.25}},
+    robot="armature_kg_m2 = 0.05\nlocked_rad = {slide_0 = 0.0, slide_1 = 0.0}",
+)
 RATIO, OFFSET = -1.0, 1.7
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from support import urdfs
+from support.problem_texts import bolted_arm
 from support.small_plans import biped_problem
 from support.small_robots import biped
 from typer.testing import CliRunner
@@ -110,40 +111,18 @@ def test_torque_that_does_not_hold_the_start_is_doubted(tmp_path: Path) -> None:
 def test_distant_links_that_touch_at_the_start_are_doubted(tmp_path: Path) -> None:
     """A hand that begins in its pedestal is not kept apart from it."""
     (tmp_path / "robot.urdf").write_text(urdfs.arm(), "utf-8")
-    text = """
-[problem]
-striker = "hand"
-point_m = [0.6, 0.0, 0.5]
-normal = [1.0, 0.0, 0.0]
-start = "START"
-
-[robot]
-urdf = "robot.urdf"
-floating = false
-
-[[robot.strikers]]
-name = "hand"
-frame = "wrist_link"
-point_m = [0.0, 0.0, 0.1]
-
-[robot.postures_rad.raised]
-shoulder = 0.5
-elbow = 1.0
-
-[robot.postures_rad.folded]
-shoulder = 1.7
-elbow = 2.3
-
-[target]
-mass_kg = 1.0
-
-[contact]
-stiffness_N_m = 1e4
-damping_N_s_m = 100.0
-"""
     file = tmp_path / "reach.toml"
+    postures = {"raised": {"shoulder": 0.5, "elbow": 1.0}, "folded": {"shoulder": 1.7, "elbow": 2.3}}
     for start, touch in (("raised", False), ("folded", True)):
-        found = json.loads(_checked(file, text.replace("START", start)))["doubts"]
+        text = bolted_arm(
+            frame="wrist_link",
+            tip=[0.0, 0.0, 0.1],
+            point=[0.6, 0.0, 0.5],
+            normal=[1.0, 0.0, 0.0],
+            start=start,
+            postures=postures,
+        )
+        found = json.loads(_checked(file, text))["doubts"]
         told = [doubt for doubt in found if doubt.startswith("links touch in the start posture")]
         assert ["'base' and 'wrist_link'" in doubt for doubt in told] == [True] * touch
 

@@ -1,7 +1,8 @@
-"""Cases and helpers that several tests share: those of `test_problem_file.py`."""
+"""Texts of problem files and robots that several tests share."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 ARM = """\
@@ -27,3 +28,36 @@ def write(folder: Path, text: str, name: str = "problem.toml") -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def bolted_arm(
+    *,
+    frame: str,
+    point: Sequence[float],
+    normal: Sequence[float],
+    start: str,
+    postures: Mapping[str, Mapping[str, float]],
+    name: str = "",
+    tip: Sequence[float] = (0.0, 0.0, 0.0),
+    robot: str = "",
+) -> str:
+    """A problem file of ``robot.urdf`` beside it, bolted, that hits a free mass of 1 kg.
+
+    frame, tip (3,) [m] : of the striker "hand".  point (3,) [m], normal (3,) : where it hits.  start : of the
+    postures, angles by joint.  name : of the problem.  robot : more keys of [robot].
+    """
+    named = [f'name = "{name}"'] if name else []
+    angles = [
+        line
+        for posture, joints in postures.items()
+        for line in (f"[robot.postures_rad.{posture}]", *(f"{joint} = {at}" for joint, at in joints.items()))
+    ]
+    return "\n".join(
+        [
+            *("[problem]", *named, 'striker = "hand"', f'start = "{start}"'),
+            *(f"point_m = {list(point)}", f"normal = {list(normal)}"),
+            *("[robot]", 'urdf = "robot.urdf"', "floating = false", robot),
+            *("[[robot.strikers]]", 'name = "hand"', f'frame = "{frame}"', f"point_m = {list(tip)}", *angles),
+            *("[target]", "mass_kg = 1.0", "[contact]", "stiffness_N_m = 1e4", "damping_N_s_m = 100.0", ""),
+        ]
+    )

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from support.picture_checks import frowns
+from support.problem_texts import bolted_arm
 from typer.testing import CliRunner
 
 from impactopt import InputError
@@ -336,32 +337,16 @@ PRESS = """<robot name="press">
 @pytest.mark.slow
 def test_a_prismatic_joint_has_metres(tmp_path: Path) -> None:
     """In the table and the picture: moved by metres, with a servo in N s/m."""
-    (tmp_path / "press.urdf").write_text(PRESS, encoding="utf-8")
-    (tmp_path / "press.toml").write_text(
-        """
-        [problem]
-        striker = "ram"
-        point_m = [0.0, 0.0, 0.0]
-        normal = [1.0, 0.0, 0.0]
-        start = "zero"
-        [robot]
-        urdf = "press.urdf"
-        floating = false
-        kd_N_m_s_rad.slide = 100.0
-        [[robot.strikers]]
-        name = "ram"
-        frame = "ram"
-        point_m = [0.0, 0.0, 0.0]
-        [robot.postures_rad.zero]
-        slide = 0.0
-        [target]
-        mass_kg = 1.0
-        [contact]
-        stiffness_N_m = 1e4
-        damping_N_s_m = 100.0
-        """,
-        encoding="utf-8",
+    (tmp_path / "robot.urdf").write_text(PRESS, encoding="utf-8")
+    text = bolted_arm(
+        frame="ram",
+        point=[0.0, 0.0, 0.0],
+        normal=[1.0, 0.0, 0.0],
+        start="zero",
+        postures={"zero": {"slide": 0.0}},
+        robot="kd_N_m_s_rad.slide = 100.0",
     )
+    (tmp_path / "press.toml").write_text(text, encoding="utf-8")
     place, gain = "at_contact.joints_rad.slide", "robot.kd_N_m_s_rad.slide"
     study = sweep_from_data(
         {

@@ -70,6 +70,9 @@ def compared_record(
         problem=read.text,
         problem_path=read.path,
     )
+    lost = [f"no result of the {names[job]}: {reason}" for job, reason in failed.items() if job != BASELINE]
+    if lost:  # readers of files and pages have not seen the progress
+        record.summary["note"] = "; ".join(filter(None, [record.summary.get("note"), *lost]))
     if BASELINE in jobs:
         record.summary[BASELINE] = done.get(BASELINE) or {"method": METHOD, "error": failed[BASELINE]}
     return record

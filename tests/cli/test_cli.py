@@ -267,7 +267,10 @@ def test_a_plan_outlives_a_replay_that_breaks_down(
     monkeypatch.setattr(FakeSolution, "validate", broken)
     _, err = run("solve", file, "--out", tmp_path / "out")
     assert "ValueError: mujoco accepts no such body" in err
-    assert load_record(tmp_path / "out").summary["impulse_Ns"] > 0
+    summary = load_record(tmp_path / "out").summary
+    assert summary["impulse_Ns"] > 0
+    for engine in ("pinocchio", "mujoco"):
+        assert f"ValueError: {engine} accepts no such body" in summary["note"]
 
 
 def test_the_files_solver_settings_reach_the_solver(planner: Planner, file: Path, tmp_path: Path) -> None:

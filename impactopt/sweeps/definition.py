@@ -402,7 +402,9 @@ def _checked(data: dict[str, Any], path: Path, text: str, lines: Mapping[Place, 
             scenarios = (f"{name.replace(' ', '_')}_" for name in names)
             results, prefixes = PLAN_COLUMNS, (*PLAN_PREFIXES, *scenarios)
         known = [*reader.names, *results]
-        for name in content.figure.renamed(reader.full_name).columns:
+        figure = content.figure.renamed(reader.full_name)
+        mistakes += _cells_without_case(figure, design)
+        for name in figure.columns:
             if name not in known and not name.startswith(prefixes):
                 text = f"{name!r} is neither varied nor among the outputs{did_you_mean(name, known)}"
                 mistakes.append(Mistake(place=("figure",), sections=1, text=text))
@@ -430,6 +432,22 @@ def _check_collisions(path: Path, base: ProblemFile, content: SweepFile, design:
         ).check(columns)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _cells_without_case(figure: Figure, design: Design) -> list[Mistake]:
+    """Mistake: a heatmap whose cells would have no case, or several."""
+    values = {axis.key: axis.values for axis in design.axes}
+    x, y = (values.get(name) for name in (figure.x, figure.y[0]))
+    if figure.drawn_as != "heatmap" or not (isinstance(x, np.ndarray) and isinstance(y, np.ndarray)):
+        return []  # a result's values are known after the sweep
+    cells = len(np.unique(x)) * len(np.unique(y))
+    if cells == design.cases:
+        return []
+    text = (
+        f"{design.cases} cases for the heatmap's {cells} cells of {figure.x} and {figure.y[0]}; "
+        "vary these two alone in [grid], or take a scatter"
+    )
+    return [Mistake(place=("figure", "kind"), sections=1, text=text)]
 
 
 def _near(problem: str, path: Path) -> Path:

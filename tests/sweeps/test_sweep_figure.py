@@ -261,6 +261,18 @@ def test_what_a_figure_names_has_to_be_there() -> None:
         sweep_from_data(collisions_data(kind="heat map"))
 
 
+def test_a_heatmap_has_one_case_in_each_cell() -> None:
+    """It was refused after the whole sweep."""
+    data = collisions_data()
+    data["grid"]["contact.stiffness"] = [1e4, 2e4]
+    with pytest.raises(InputError, match=r"kind: 12 cases for the heatmap's 6 cells of at_contact.speed"):
+        sweep_from_data(data)
+    del data["grid"]["contact.stiffness"]
+    data["grid"]["target.mass"] = [0.1, 0.1]  # the same cell twice
+    with pytest.raises(InputError, match=r"6 cases for the heatmap's 3 cells"):
+        sweep_from_data(data)
+
+
 @pytest.mark.parametrize(
     ("figure", "says"),
     [

@@ -182,12 +182,12 @@ def _cpu() -> str:
 # Beyond this many, -O0: compiled ten times sooner, two to three times slower, but 5 times faster than the VM.
 MAX_OPTIMIZED = 60_000
 # Loops over vectors gain from all that keeps the order of sums; -ffast-math would not keep it, nor NaN.
-_NATIVE_FLAGS = "-fvisibility=hidden -ffp-contract=fast -fno-math-errno -fno-trapping-math"
-_NATIVE_LEVEL = f"-O3 {_NATIVE_FLAGS}"
+NATIVE_FLAGS = "-fvisibility=hidden -ffp-contract=fast -fno-math-errno -fno-trapping-math"
+_NATIVE_LEVEL = f"-O3 {NATIVE_FLAGS}"
 
 
 def _level() -> str:
-    return f"-O0 {_NATIVE_FLAGS}" if quick_to_compile() else _NATIVE_LEVEL
+    return f"-O0 {NATIVE_FLAGS}" if quick_to_compile() else _NATIVE_LEVEL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,8 +284,9 @@ def library_of(
 
     def linked() -> tuple[Path, ...]:
         code = [shared.code, f"{shared.level} -c", compiler.key]
+        key = hashlib.sha256("\0".join(code).encode()).hexdigest()[:16]
         # many functions that want it are compiled at once
-        with locked(directory / f"{slug(shared.name)}.lock", on_wait=lambda: None):
+        with locked(directory / f"{slug(shared.name)}-{key}.lock", on_wait=lambda: None):
             return (directory / _made(directory, scratch, f"{shared.name}.o", code, compiler, tuple)[0],)
 
     return _made(directory, scratch, f"{name}.so", [*parts, shared.code, shared.level], compiler, linked)

@@ -48,11 +48,13 @@ class TreeFunctions:
         `hand_speed_at` (q, v, normal). With friction also the striking point's root, velocity and drift.
     root, held : (row, column) of the nonzeros. Columns of `root` are joints, hand, other velocities; those
         of `held` are the constraints.
+    ground : whether `tree` has the outputs for the ground's wrench.
     """
 
     functions: list[Any]
     root: list[tuple[int, int]]
     held: list[tuple[int, int]]
+    ground: bool
 
 
 def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool, slides: bool = False) -> TreeFunctions:
@@ -90,7 +92,7 @@ def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool, slides: bool
         ca.Function("integrate", [rb.q, d], [rb.integrate(d)]),
         ca.Function("hand_speed_at", known, speeds),
     ]
-    return TreeFunctions(functions=functions, root=places, held=_nonzeros(held))
+    return TreeFunctions(functions=functions, root=places, held=_nonzeros(held), ground=ground)
 
 
 def _nonzeros(matrix: Any) -> list[tuple[int, int]]:
@@ -179,8 +181,11 @@ def to_velocity_basis(frozen: FrozenDynamics) -> Any:
     return ca.Function("to_velocity_basis", [rb.q, by_q], [ca.densify(ca.mtimes(rb.tangent_map().T, by_q))])
 
 
-def c_code(name: str, functions: list[Any]) -> str:
-    """C of static functions f(arg, res, iw, w, mem); several such texts go into one file."""
+def c_code(name: str, functions: list[Any], *, exported: bool = False) -> str:
+    """C of static functions f(arg, res, iw, w, mem); several such texts go into one file.
+
+    exported : not static, but for all they call.
+    """
     generator = ca.CodeGenerator(f"{name}.c", {"with_header": False})
     for function in functions:
         generator.add(function)
@@ -188,6 +193,9 @@ def c_code(name: str, functions: list[Any]) -> str:
     static = re.sub(
         r"^(casadi_real|casadi_int|void|int) casadi_", r"static \g<0>", generator.dump(), flags=re.M
     )
+    if exported:
+        main = r"^CASADI_SYMBOL_EXPORT (?=int \w+\(const casadi_real\*\* arg)"
+        static = re.sub(main, "", static, flags=re.M)
     return f"#undef CASADI_PREFIX\n{static}\n"
 
 
@@ -202,13 +210,13 @@ _LINEAR = {
 }
 
 
-def simd_tree(frozen: FrozenDynamics, tree: TreeFunctions, *, ground: bool) -> list[tuple[Any, str]]:
+def simd_tree(frozen: FrozenDynamics, tree: TreeFunctions) -> list[tuple[Any, str]]:
     """Tangents (`simd_tangent`) of `tree` by q, of its outputs that depend on v (`approach`) by v, and of
     `drift` by both; directions of q are in the basis of v."""
     parts = frozen._tree
     known = [parts.rb.q, parts.rb.v, parts.normal]
     basis = ca.Function("basis", [parts.rb.q], [parts.rb.tangent_map()])
-    out = [parts.hand_speed] + ([parts.carrying_wrench] if ground and not frozen.bias else [])
+    out = [parts.hand_speed] + ([parts.carrying_wrench] if tree.ground and not frozen.bias else [])
     whole, drift, *_ = tree.functions
     made = [simd_tangent(whole, {0: basis})]
     made.append(simd_tangent(ca.Function("approach", known, out), {1: None}))
@@ -433,7 +441,7 @@ def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: T
         "LEFT_OUT_BY_RK4": repr(LEFT_OUT_BY_RK4),
         "SECOND_INTEGRALS": int(model.second_integrals),
         "FREEZES": freezes,
-        "GROUND": int(bool({"ground_wrench", "zmp"} & {*outputs})),
+        "GROUND": int(tree.ground),
         "WRENCHES": int(bool(frozen_for(outputs)) or freezes > 0),
         "HELD_HISTORY": int(bool({*OF_SOLES, "hand_wrench"} & {*outputs})),
         "HISTORIES": int(bool({*HISTORIES} & {*outputs})),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.resources import files
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.codegen.compiler import NativeCode, quick_to_compile
+from impactopt.codegen.compiler import NATIVE_FLAGS, NativeCode, SharedCode, quick_to_compile
 from impactopt.collision.checks import LEAST_PIVOT
 from impactopt.collision.graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
 from impactopt.collision.native.sizes import (
@@ -34,7 +35,10 @@ from impactopt.errors import InputError
 _IMPLICIT = ("", "_factor", "_step", "_remainders", "_events", "_run")  # parts of implicit.h
 # The generated code of the tree is long and without branches. These options make it a sixth faster than -Og
 # for half a second more of the compiler; -O2 takes another half and gains nothing.
-_TREE, _QUICK_TREE = '"O1", "expensive-optimizations", "reciprocal-math", "schedule-insns2"', '"O0"'
+_TREE = f"-O1 -fexpensive-optimizations -freciprocal-math -fschedule-insns2 {NATIVE_FLAGS}"
+_QUICK_TREE = f"-O0 {NATIVE_FLAGS}"
+_STATIC = "#define CASADI_SYMBOL_EXPORT static\n"
+_ARGUMENTS = "(const double **arg, double **res, long long *iw, double *w, int mem)"
 _OF_DIFFERENCES = 1e-12
 # Relative length of central differences. The error of implicit steps differs between two collisions, and a
 # longer difference divides it by more; the error of steps of constant length does not.
@@ -56,10 +60,11 @@ def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every
     Values agree with the graph's to rounding; the graph has no implicit steps, though. The C function has no
     derivatives. Without a compiler the graph, or one with implicit steps, is used in its place.
     """
-    code = _code(collision, "collision", outputs, every)
-    return NativeCode(
-        name="collision", code=code, graph=lambda: _guarded(collision, _over(collision, outputs, every))
-    )
+
+    def graph() -> ca.Function:
+        return _guarded(collision, _over(collision, outputs, every))
+
+    return _native(graph, collision, "collision", outputs, every)
 
 
 def native_gradient(collision: SteppedModel, output: str) -> NativeCode | ca.Function:
@@ -79,11 +84,7 @@ def native_gradient(collision: SteppedModel, output: str) -> NativeCode | ca.Fun
 
     if collision.contact_friction is not None:
         return graph()
-    return NativeCode(
-        name="collision_gradient",
-        code=_code(collision, "collision_gradient", (output,), 1),
-        graph=graph,
-    )
+    return _native(graph, collision, "collision_gradient", (output,))
 
 
 def native_jacobian(collision: SteppedModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
@@ -92,9 +93,7 @@ def native_jacobian(collision: SteppedModel, outputs: tuple[str, ...], *, every:
     def none() -> Any:
         raise InputError(_NEEDS_COMPILER.format("jacobian_function", ""))
 
-    return NativeCode(
-        name="collision_jacobian", code=_code(collision, "collision_jacobian", outputs, every), graph=none
-    )
+    return _native(none, collision, "collision_jacobian", outputs, every)
 
 
 def least_size(name: str) -> float:
@@ -113,8 +112,7 @@ def native_differences(
     def none() -> Any:
         raise InputError(_NEEDS_COMPILER.format("function", "; or differentiate what `graph` gives"))
 
-    code = _code(collision, "collision_differences", outputs, every, by)
-    return NativeCode(name="collision_differences", code=code, graph=none)
+    return _native(none, collision, "collision_differences", outputs, every, by)
 
 
 def _over(collision: SteppedModel, outputs: tuple[str, ...], every: int) -> ca.Function:
@@ -144,12 +142,18 @@ def _guarded(collision: SteppedModel, graph: ca.Function) -> ca.Function:
     return ca.Function(graph.name(), inputs, out, graph.name_in(), graph.name_out())
 
 
-def _code(
-    collision: SteppedModel, name: str, outputs: tuple[str, ...], every: int, by: tuple[str, ...] = ()
-) -> str:
+def _native(
+    graph: Callable[[], ca.Function],
+    collision: SteppedModel,
+    name: str,
+    outputs: tuple[str, ...],
+    every: int = 1,
+    by: tuple[str, ...] = (),
+) -> NativeCode:
     frozen, gradient = frozen_dynamics(collision), name == "collision_gradient"
     jacobian = name == "collision_jacobian"
-    ground = bool({"ground_wrench", "zmp"} & {*outputs})
+    # the soles' places cost nothing beside the rest, and with them all outputs have one tree
+    ground = bool({"ground_wrench", "zmp"} & {*outputs}) or (name == "collision" and frozen.bias)
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     tree = tree_functions(frozen, collision.n_servos, ground=ground, slides=model.slides)
     scalars = scalar_functions(model, method=collision.stepping)
@@ -166,7 +170,7 @@ def _code(
         shapes |= dict.fromkeys(by_both, (collision.robot.nv, 1))
     lanes: list[str] = []
     if jacobian:
-        moved = simd_tree(frozen, tree, ground=ground)
+        moved = simd_tree(frozen, tree)
         of_tree = [*of_tree, *[parts for parts, _ in moved]]
         lanes = [_LANES[0], *[code for _, code in moved], _LANES[1]]
         scalars += backwards([f for f in scalars if f.name() == "target_energy"])
@@ -190,12 +194,8 @@ def _code(
         return [folder.joinpath(name).read_text(encoding="utf-8") for name in names]
 
     parts = [
-        "#define CASADI_SYMBOL_EXPORT static\n",
-        "#pragma GCC push_options",
-        f"#pragma GCC optimize ({_QUICK_TREE if quick_to_compile() else _TREE})",
-        *text("angles.h"),
-        c_code("tree", of_tree),
-        "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
+        _STATIC,
+        *(f"int {f.name()}{_ARGUMENTS};" for f in of_tree),
         c_code("scalars", scalars),
         f"#define GRADIENT {int(gradient or jacobian)}",
         f"#define NAME {name}\n#define OF_NAME(part) {name}_##part",
@@ -217,4 +217,9 @@ def _code(
         files_used += ["final_outputs.h", "tangent.h", *tangents, "jacobian.c"]
     else:
         files_used += ["final_outputs.h", "differences.c" if differs else "collision.c"]
-    return "\n".join([*parts, *text(*files_used, "interface.c")])
+    code = "\n".join([*parts, *text(*files_used, "interface.c")])
+    # The tree is five sixths of a humanoid's code, and the same for all laws, targets and outputs.
+    shared = "\n".join([_STATIC, *text("angles.h"), c_code("tree", of_tree, exported=True)])
+    level = _QUICK_TREE if quick_to_compile() else _TREE
+    tree_code = SharedCode(name="tree", code=shared, level=level)
+    return NativeCode(name=name, code=code, graph=graph, shared=tree_code)

@@ -227,11 +227,13 @@ def test_a_process_that_dies_is_a_failure_of_its_collision() -> None:
     assert fidelity.second_opinion([found]) == {"mujoco_vs_pinocchio_pct": None, "mujoco_collisions": 0}
 
 
+@pytest.mark.slow
 def test_a_picture_of_the_rows(short: Report) -> None:
     figure = fidelity_picture(short.numbers["rows"])
     assert len(figure.axes) == 1 and figure.axes[0].get_title(loc="left") == "standin"
 
 
+@pytest.mark.slow
 def test_the_command_fidelity(monkeypatch: pytest.MonkeyPatch, short: Report, tmp_path: Any) -> None:
     asked: dict[str, Any] = {}
 

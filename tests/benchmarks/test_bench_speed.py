@@ -169,6 +169,7 @@ def test_a_point_mass_has_no_servo() -> None:
         sdc("arm", VirtualMass).describe(("torque",))
 
 
+@pytest.mark.slow
 def test_joints_that_share_none_with_the_blow_s_limb_change_nothing() -> None:
     robot = standin(floating=False)
     options: dict[str, Any] = {"striker": "right_hand", "normal": X, "law": LAW, "target": TARGET}
@@ -265,6 +266,7 @@ def test_a_step_that_is_unstable_has_a_row_that_says_so(setup: Setup) -> None:
     assert not found and "unstable" in refused[0]["note"]
 
 
+@pytest.mark.slow
 @compiled
 def test_the_bench_of_skipping_says_what_each_saves(setup: Setup) -> None:
     numbers = skip.run(quiet, setup=setup, repeats=3).numbers
@@ -299,6 +301,7 @@ def test_joints_that_are_locked_keep_their_places() -> None:
         assert small.joint_positions(less.q)[small.joint_index(name)] == robot.joint_positions(q)[k]
 
 
+@pytest.mark.slow
 @compiled
 def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(
     setup: Setup, monkeypatch: pytest.MonkeyPatch

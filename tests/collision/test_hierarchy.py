@@ -69,6 +69,7 @@ def inside_the_hand():
 
 
 # ------------------------------------------------------------ one interface
+@pytest.mark.slow
 def test_every_rung_takes_the_same_and_gives_the_same_kind_of_result():
     robot = small()
     q, v, torque = situation(robot, **FIST)

@@ -62,6 +62,8 @@ def same_bodies(one: ImpactProblem, other: ImpactProblem) -> bool:
     """True if clearance constraints have the same meaning in two problems."""
     if not (one.keeps_apart and other.keeps_apart) or one.robot is not other.robot:
         return False
+    if [one.swing.grading, one.follow.grading] != [other.swing.grading, other.follow.grading]:
+        return False  # they are at other nodes
     if [body.name for body in one.bodies.world] != [body.name for body in other.bodies.world]:
         return False
     # other links may touch, or be on the ground, in another start posture

@@ -193,6 +193,16 @@ def test_friction_that_takes_all_of_a_motor_is_refused(arm_transcription: Transc
         changed(arm_transcription, terms=(MotorCurve(fraction=0.5),), robot=robot)
 
 
+@pytest.mark.parametrize("term", [MotorCurve(), PowerLimit()])
+def test_a_bound_on_motors_without_data_is_refused(term: MotorCurve | PowerLimit) -> None:
+    problem = load_problem("arm_planar")
+    data: dict[str, Any] = {"stall_torque": 200.0, "no_load_speed": 10.0, "power_limit": 100.0}
+    known = problem.robot.with_actuators({"elbow": Actuator(**data)})
+    assert replace(problem, terms=(term,), robot=known).terms == (term,)  # of one motor is enough
+    with pytest.raises(InputError, match=r"none of 'planar_arm' is: give their data as .*robot.actuators"):
+        replace(problem, terms=(term,))
+
+
 def test_an_impact_without_duration_has_no_gear_load_but_a_jump(arm_transcription: Transcription) -> None:
     terms = (GearLoad(limit=0.9), VelocityJump(limit=0.5))
     t = changed(arm_transcription, terms=terms, collision="virtual-mass")

@@ -132,7 +132,7 @@ TERMS: dict[str, st.SearchStrategy[Any]] = {
     "legs": st.builds(terms.LegExtension, minimum=st.floats(0, 1)),
     "rate": st.builds(
         terms.TorqueRate,
-        limit=POSITIVE | st.dictionaries(st.sampled_from(["elbow", "wrist"]), POSITIVE),
+        limit=POSITIVE | st.dictionaries(st.sampled_from(["elbow", "wrist"]), POSITIVE, min_size=1),
     ),
     "self": st.builds(terms.SelfCollision, margin=SMALL, enabled=st.booleans()),
     "keep": st.builds(terms.KeepOut, margin=SMALL, enabled=st.booleans()),

@@ -47,6 +47,12 @@ def test_a_limit_by_joint_is_not_changed_by_its_caller() -> None:
     assert load.limit == {"joint_1": 1.0}
 
 
+def test_an_empty_table_of_limits_is_refused() -> None:
+    for kind in (GearLoad, PowerLimit, VelocityJump):
+        with pytest.raises(InputError, match=f"{kind.__name__}.limit names no joint, and would bound none"):
+            kind(limit={})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("damping", [0.0, 300.0])

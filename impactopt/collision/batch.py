@@ -33,7 +33,7 @@ from impactopt.collision.native import native_collision
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.settings import NO_LIMIT
 from impactopt.collision.stepped import SteppedModel
-from impactopt.errors import InputError, check_array, raw_array
+from impactopt.errors import InputError, check_array, check_whole, raw_array
 from impactopt.robots.checks import unit_parts
 
 Array = NDArray[np.float64]
@@ -89,9 +89,9 @@ class Batch:
         threads: int | None = None,
     ) -> dict[str, Array]:
         """Outputs of many collisions; see `SteppedModel.batch`."""
-        cores = os.cpu_count() or 1 if threads is None else threads
-        if not isinstance(cores, int) or cores < 1:
-            raise InputError(f"threads: {threads!r}; give a whole number >= 1")
+        cores = (
+            os.cpu_count() or 1 if threads is None else check_whole("threads", threads, least=1, most=10**4)
+        )
         given = _inputs(self.model, q, v, torque, settings)
         unstable = None if self.model.stepping == "implicit" else self._unstable(given)
         count, function = given["q"].shape[0], self._function

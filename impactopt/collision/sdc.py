@@ -13,7 +13,7 @@ from impactopt.collision.checks import caution, more_often
 from impactopt.collision.settings import Effects, JointFriction, servo_settings
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import ContactFriction, ContactLaw, FreeMass, SpringDamper, Target
-from impactopt.errors import InputError, check_array, check_choice, check_kind
+from impactopt.errors import InputError, check_array, check_choice, check_kind, check_whole
 from impactopt.kinematics.stance import BothSoles, FixedBase, Stance
 from impactopt.robots.robot import Robot
 
@@ -77,8 +77,7 @@ class SDC(SymbolicModel):
             raise InputError(
                 "friction is given, but effects.friction is off: switch it on, or leave friction out"
             )
-        if not isinstance(self.freezes, int) or self.freezes < 0:
-            raise InputError(f"freezes: {self.freezes!r}; give a whole number >= 0")
+        object.__setattr__(self, "freezes", check_whole("freezes", self.freezes, least=0, most=10**6))
         if self.accuracy is not None and not check_array("accuracy", self.accuracy, ()) > 0:
             raise InputError(f"accuracy: {self.accuracy:g}; give a number > 0, or None for no estimate")
         super().__post_init__()

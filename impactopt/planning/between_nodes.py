@@ -10,9 +10,16 @@ from dataclasses import replace
 
 from impactopt.errors import InputError
 from impactopt.planning.budget import Budget, touching, with_effort_of
-from impactopt.planning.clearance_constraints import Margins, clearance_violations, solve_with_clearance
+from impactopt.planning.clearance_constraints import (
+    ClearanceViolations,
+    Margins,
+    clearance_violations,
+    solve_with_clearance,
+)
 from impactopt.planning.contact_replay import ACCEPTABLE_WITHIN, SOLVED_WITHIN
+from impactopt.planning.diagnosis import MAX_NAMED
 from impactopt.planning.refinement import Additions, Guess, Outcome, program_for, refine, start_of
+from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.contact_refinement import TOLERANCE_PCT, all_halved, refined_elements
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import Elements, contact_elements, nodes_to_add
@@ -41,7 +48,9 @@ class BetweenNodes:
     def __init__(self, budget: Budget, margins: Margins | None, *, mesh: bool = True) -> None:
         self._budget, self._margins, self._mesh = budget, margins, mesh
         self._rounds, self._refined = 0, 0 if mesh else _MESH_ROUNDS
-        self._clear: Outcome[Transcription] | None = None  # the last one without penetration
+        # the last one without penetration, and the clearances that it loses nevertheless
+        self._clear: Outcome[Transcription] | None = None
+        self._lost: ClearanceViolations | None = None
 
     def refined(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
         """Outcome refined by this oracle alone; failed if bodies still penetrate or its replay disagrees."""
@@ -53,21 +62,37 @@ class BetweenNodes:
 
     def _checked(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
         """Outcome checked by its replay; if bodies penetrate, the last outcome without penetration instead,
-        or a failed one.
+        or a failed one. Bodies that keep less than half of their clearance make it acceptable.
         """
-        # `missing` has found the last outcome clear already.
-        if self._margins is None or not outcome.usable or outcome is self._clear:
+        if self._margins is None or not outcome.usable:
             return outcome.checked()
         with contextlib.suppress(InputError):
-            # Only penetration refuses a solution; a part of a margin may be lost.
-            found = clearance_violations(outcome.at, self._margins, share=1.0)
-            if found is not None and found.depth > 0:
-                if self._clear is not None:
-                    result = with_effort_of(self._clear.result, outcome.result)
-                    return replace(self._clear, result=result).checked()
-                names = (" and ".join(self._margins.bodies.names(pair)) for pair in found.pairs)
-                return replace(outcome, result=touching(outcome.result, found.depth, names, "solution"))
+            # `missing` has checked the last clear outcome already.
+            clear = outcome is self._clear
+            lost = self._lost if clear else clearance_violations(outcome.at, self._margins)
+            if lost is not None and lost.depth > 0:
+                if self._clear is None:
+                    pairs = (pair for pair, distance in lost.nearest.items() if distance < 0)
+                    names = (" and ".join(self._margins.bodies.names(pair)) for pair in pairs)
+                    return replace(outcome, result=touching(outcome.result, lost.depth, names, "solution"))
+                result = with_effort_of(self._clear.result, outcome.result)
+                outcome, lost = replace(self._clear, result=result), self._lost
+            if lost is not None:
+                outcome = replace(outcome, result=self._too_near(outcome.result, lost))
         return outcome.checked()
+
+    def _too_near(self, result: SolverResult, lost: ClearanceViolations) -> SolverResult:
+        """Acceptable result, whose message names the bodies that keep less than half of their clearance."""
+        margins, told = self._margins, []
+        assert margins is not None
+        for pair, distance in sorted(lost.nearest.items(), key=lambda item: item[1])[:MAX_NAMED]:
+            section = margins.term(pair).name.replace(" ", "_")
+            told.append(
+                f"{' and '.join(margins.bodies.names(pair))} {1e3 * distance:.2g} mm instead of "
+                f"{1e3 * margins.of(pair):.2g} ([terms.{section}] margin_m)"
+            )
+        message = f"Bodies keep less than half of their clearance: {'; '.join(told)}."
+        return replace(result, status=Status.ACCEPTABLE, message=message)
 
     def missing(self, outcome: Outcome[Transcription]) -> Additions[Transcription] | None:
         """Nodes, contact elements and clearance constraints that a solution lacks."""
@@ -78,7 +103,7 @@ class BetweenNodes:
             if self._margins is not None:
                 violated = clearance_violations(outcome.at, self._margins)
                 if violated is None or violated.depth <= 0:
-                    self._clear = outcome
+                    self._clear, self._lost = outcome, violated
         if self._rounds >= self._most_for(outcome):
             return None
         # nodes of the next program: those for clearance, and with those for limits; elements None: the same

@@ -13,7 +13,7 @@ nodes are too dense for another one, and during contact, which gets no further n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -62,6 +62,8 @@ def same_bodies(one: ImpactProblem, other: ImpactProblem) -> bool:
     """True if clearance constraints have the same meaning in two problems."""
     if not (one.keeps_apart and other.keeps_apart) or one.robot is not other.robot:
         return False
+    if [one.swing.grading, one.follow.grading] != [other.swing.grading, other.follow.grading]:
+        return False  # they are at other nodes
     if [body.name for body in one.bodies.world] != [body.name for body in other.bodies.world]:
         return False
     # other links may touch, or be on the ground, in another start posture
@@ -356,13 +358,13 @@ class ClearanceViolations(NamedTuple):
     """Clearance violations of a solution, and the additions to its program that they require.
 
     constraints : to replace the program's own of the same keys.  depth [m] : deepest penetration, negative if
-    there is none.  pairs : the bodies that violate their clearance.  nodes : all further nodes of the
-    program, those to add included.
+    there is none.  nearest [m] : least distance of the bodies that violate their clearance.  nodes : all
+    further nodes of the program, those to add included.
     """
 
     constraints: Constraints
     depth: float
-    pairs: frozenset[Pair]
+    nearest: Mapping[Pair, float]
     nodes: MoreNodes
 
 
@@ -417,8 +419,9 @@ def clearance_violations(
         normals = [bodies.closest(nodes.at, k, pair).normal for k in adjacent]
         if not added.add(approach, bool(normals[0] @ normals[-1] < 0)):
             raised.add(adjacent, pair, approach.distance)
-    depth = max(-approach.distance for _, approach in approaches)
-    return ClearanceViolations(raised.constraints, depth, frozenset(pair for _, pair in worst), added.all)
+    # the nearest approach of a pair last: it stays in the table
+    nearest = {pair: near.distance for pair, near in sorted(approaches, key=lambda a: -a[1].distance)}
+    return ClearanceViolations(raised.constraints, -min(nearest.values()), nearest, added.all)
 
 
 def deepest_penetration(t: ContactProgram, x: Array, margins: Margins) -> tuple[float, list[Pair]]:

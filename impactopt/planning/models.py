@@ -21,7 +21,6 @@ from impactopt.kinematics.operational_space import holding_torque
 from impactopt.planning.budget import Budget
 from impactopt.planning.contact_replay import ModelError, collision_error
 from impactopt.planning.gain_selection import with_factors_of
-from impactopt.planning.lazy_constraints import lazy_terms_of
 from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import carried
 from impactopt.planning.solution import Solved
@@ -58,8 +57,8 @@ def check_start(start: Solved, problem: ImpactProblem, *, motion: bool) -> None:
 
     Raises
     ------
-    InputError : the solution is of another robot, or its program has collisions or an abort motion for other
-        scenarios.
+    InputError : the solution is of another robot, stance or number of intervals, or its program has
+        collisions or an abort motion for other scenarios.
     """
     old = start.problem
     if old.robot.joint_names != problem.robot.joint_names:
@@ -78,6 +77,27 @@ def check_start(start: Solved, problem: ImpactProblem, *, motion: bool) -> None:
             f"start: the scenarios of the solution are {has}, those of the problem {wanted}, and each has "
             "variables of its own: give a solution with as many scenarios, or leave start out"
         )
+    of_old, of_new = (_unmapped(p, motion=motion) for p in (old, problem))
+    for what, has in of_old.items():
+        if of_new[what] != has:
+            raise InputError(
+                f"start: {what} of the solution: {has or 'none'}, of the problem: {of_new[what] or 'none'}; "
+                "give a solution with the same, or leave start out"
+            )
+
+
+def _unmapped(problem: ImpactProblem, *, motion: bool) -> dict[str, str]:
+    """Parts of a program whose variables `warm_start` does not map to other ones, by their names."""
+    stance, robot, stances = problem.stance, problem.robot, problem.stances
+    fixed = " and ".join([*stance.sole_names(robot), *(hand.name for hand in stance.held_hands(robot))])
+    if not motion:
+        return {"soles and hands that are fixed": fixed}
+    splines = [problem.swing, problem.follow, *(s.phase for s in stances if s.phase is not None)]
+    phases = [" and ".join(s.soles) + " (impact)" * (s.phase is None) for s in stances]
+    return {
+        "soles and hands that are fixed": ", then ".join(phases) or fixed,
+        "intervals of swing, follow-through and stance phases": ", ".join(str(s.intervals) for s in splines),
+    }
 
 
 def carried_start(
@@ -88,10 +108,17 @@ def carried_start(
     old : makes the solution's program.  constraints : clearance constraints of the new one.
     """
     before, now = (
-        (p.collision, p.freezes, p.friction, lazy_terms_of(p), p.gains) for p in (start.problem, t.problem)
+        (
+            p.collision,
+            p.freezes,
+            p.friction,
+            [type(part) for part in (*p.active_terms, *p.objectives)],
+            p.gains,
+        )
+        for p in (start.problem, t.problem)
     )
     # Same variables and constraints: the result fits as it is.
-    if before == now:
+    if before == now and len(start.result.x) == t.program.n:
         return start.result
     new = t.with_clearance(constraints)
     found = carried(new, old().with_clearance(start.clearance_constraints), start.result)

@@ -36,7 +36,8 @@ from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.support import margin, shrink, support_polygon
 from impactopt.problem.motion_style import STYLES
 from impactopt.problem.objectives import Penetration, TargetEnergy
-from impactopt.problem.terms import ContactWrenchCone, Grip, Term
+from impactopt.problem.terms import ContactWrenchCone, Grip, MotorCurve, PowerLimit, Term
+from impactopt.robots.actuators import numbers_of
 from impactopt.robots.checks import LEG, check_arms
 from impactopt.robots.gains import GainFactor, scaled_gains
 from impactopt.robots.robot import Robot
@@ -156,6 +157,19 @@ def check_hands(problem: Any) -> None:
         )
     if p.collision != "full":
         raise InputError(f'a plan whose hand holds on needs collision="full", not {p.collision!r}')
+
+
+def check_motors(problem: Any) -> None:
+    """InputError for a bound on motors none of which has the data, so that a plan would ignore it."""
+    robot = problem.robot
+    for kind, name in ((MotorCurve, "stall_torque"), (PowerLimit, "power_limit")):
+        term = problem.extra(kind)
+        limited = term is None or getattr(term, "limit", None) is not None
+        if not limited and np.isnan(numbers_of(robot.actuators, name)).all():
+            raise InputError(
+                f"{kind.__name__} is about motors whose {name} is known, and none of {robot.name!r} is: give "
+                "their data as [[robot.actuators]], or leave it out"
+            )
 
 
 def check_strikers(problem: Any) -> None:

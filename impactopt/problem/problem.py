@@ -50,6 +50,7 @@ from impactopt.problem.checks import (
     check_gains,
     check_hands,
     check_hinges,
+    check_motors,
     check_moves,
     check_names,
     check_prices,
@@ -224,6 +225,7 @@ class ImpactProblem:
         if terms:
             for term in self.terms:
                 mistakes.attempt(partial(check_names, self.robot, term))
+            mistakes.attempt(partial(check_motors, self))
         if mistakes.attempt(self._check_objectives) and collision:
             mistakes.attempt(partial(check_energy, self))
         sound = striker and stance and terms and mistakes.attempt(partial(check_second, self))

@@ -24,13 +24,18 @@ Array = NDArray[np.float64]
 MAX_ATTACHMENTS = 100  # soles, strikers or tools of a robot; more are a mistake
 
 
-def lock_joints(model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
-    """The model without the locked joints, which stay at the given angles [rad] (0 for bare names)."""
+def locked_angles(locked: Iterable[str] | Mapping[str, float]) -> dict[str, float]:
+    """Angles [rad] of locked joints by name, 0 for bare names."""
     if isinstance(locked, str):
         raise InputError(
             f"locked: give a list of joint names or a mapping to angles, not the text {locked!r}"
         )
-    angles = dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
+    return dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
+
+
+def lock_joints(model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
+    """The model without the locked joints, which stay at the given angles [rad] (0 for bare names)."""
+    angles = locked_angles(locked)
     if not angles:
         model = model.copy()
         tell_apart(model)

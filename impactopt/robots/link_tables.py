@@ -25,9 +25,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.robot import Robot, Striker, Tool
 
 Vector = tuple[float, float, float]
+Locked = Iterable[str] | Mapping[str, float]  # as of `Robot.from_urdf`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,12 +181,21 @@ def arm_model(name: str, links: tuple[Link, ...], base: Box | None = None) -> An
     return model
 
 
-def _soft_kd(links: Iterable[Link]) -> dict[str, float]:
-    """Kd [N m s/rad] by joint of an arm's servo."""
-    return {part.joint: 0.1 * part.drive.torque for part in links}
+def _arm(
+    whole: Any, links: tuple[Link, ...], ready: Mapping[str, float], locked: Locked, options: dict[str, Any]
+) -> Robot:
+    """An arm with its servo and its posture `ready` (angles by joint), without its locked joints."""
+    model = lock_joints(whole, locked)
+    joints = joint_names(model)
+    own = {
+        "name": whole.name,
+        "kd": {part.joint: 0.1 * part.drive.torque for part in links if part.joint in joints},
+        "postures": {"ready": {joint: angle for joint, angle in ready.items() if joint in joints}},
+    }
+    return Robot.from_model(model, **{**own, **options})
 
 
-def planar_arm(**overrides: Any) -> Robot:
+def planar_arm(*, locked: Locked = (), **overrides: Any) -> Robot:
     """An invented arm of three joints in the plane x-z, on a fixed base, with a hammer.
 
     * Joints `shoulder`, `elbow`, `wrist`, about y, straight up at zero angles: 0.4, 0.36, 0.08 m, 9 kg.
@@ -193,27 +204,21 @@ def planar_arm(**overrides: Any) -> Robot:
     * Striker `hammer`: `Tool.hammer`, its handle along the hand, its face forward where the hand points up.
     * Posture `ready`: the hand level and in front, the hammer's face down.
 
-    `overrides` go to `Robot.from_model`.
+    `locked` is as of `Robot.from_urdf`; `overrides` go to `Robot.from_model`.
     """
-    options: dict[str, Any] = {
-        "name": "planar_arm",
-        "kd": _soft_kd(PLANAR),
-        "postures": {"ready": {"shoulder": -0.6, "elbow": 1.7, "wrist": 0.47}},
-    }
-    robot = Robot.from_model(arm_model("planar_arm", PLANAR), **{**options, **overrides})
+    ready = {"shoulder": -0.6, "elbow": 1.7, "wrist": 0.47}
+    robot = _arm(arm_model("planar_arm", PLANAR), PLANAR, ready, locked, overrides)
     return robot.with_tool(Tool.hammer(frame="wrist", grip=[0.0, 0.0, WRIST]))
 
 
-def _of_arm7() -> dict[str, Any]:
-    """Servo, striker and posture of the arm with seven joints."""
-    return {
-        "kd": _soft_kd(ARM7),
-        "strikers": (Striker(name="fist", frame="joint_7", point=np.array(_FIST)),),
-        "postures": {"ready": {"joint_2": -0.3, "joint_4": 1.6, "joint_6": 0.27}},
-    }
+def _arm7(whole: Any, locked: Locked, options: dict[str, Any]) -> Robot:
+    """The arm with seven joints, with its striker and posture."""
+    ready = {"joint_2": -0.3, "joint_4": 1.6, "joint_6": 0.27}
+    fist = Striker(name="fist", frame="joint_7", point=np.array(_FIST))
+    return _arm(whole, ARM7, ready, locked, {"strikers": (fist,), **options})
 
 
-def arm7(*, tool: Tool | None = None, **overrides: Any) -> Robot:
+def arm7(*, tool: Tool | None = None, locked: Locked = (), **overrides: Any) -> Robot:
     """An arm of seven joints on a fixed base, of the class of KUKA's LBR iiwa 7; it needs no files.
 
     Lengths, limits and the whole arm's mass are that arm's (source at the top of this file); the
@@ -225,22 +230,23 @@ def arm7(*, tool: Tool | None = None, **overrides: Any) -> Robot:
     * Strikers `fist`, the middle of the flange, and that of the tool.
     * Posture `ready`: elbow bent, the flange looks ahead.
 
-    `tool` is `Tool.hammer` along the flange's axis when left out. `overrides` go to `Robot.from_model`.
+    `tool` is `Tool.hammer` along the flange's axis when left out. `locked` is as of `Robot.from_urdf`;
+    `overrides` go to `Robot.from_model`.
     """
-    robot = Robot.from_model(arm_model("arm7", ARM7), **{"name": "arm7", **_of_arm7(), **overrides})
+    robot = _arm7(arm_model("arm7", ARM7), locked, overrides)
     return robot.with_tool(Tool.hammer(frame="joint_7", grip=_FIST) if tool is None else tool)
 
 
-def space_arm(**overrides: Any) -> Robot:
+def space_arm(*, locked: Locked = (), **overrides: Any) -> Robot:
     """The arm of `arm7` on an invented satellite of 60 kg, a cube of 0.5 m that floats without gravity.
 
     * Joints, drives, servo, striker `fist` and posture `ready` are those of `arm7`.
 
-    `overrides` go to `Robot.from_model`.
+    `locked` is as of `Robot.from_urdf`; `overrides` go to `Robot.from_model`.
     """
-    options = {"name": "space_arm", "gravity": [0.0, 0.0, 0.0], **_of_arm7()}
     bus = Box(mass=60.0, sides=(0.5, 0.5, 0.5), center=(0.0, 0.0, -0.1))  # up to the first joint
-    return Robot.from_model(arm_model("space_arm", ARM7, bus), **{**options, **overrides})
+    options = {"gravity": [0.0, 0.0, 0.0], **overrides}
+    return _arm7(arm_model("space_arm", ARM7, bus), locked, options)
 
 
 # Between the hips, on their axes. With thigh, shank and ankle it stands at 0.705 m.

@@ -6,7 +6,7 @@ example-robot-data (extra `robots`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import wraps
 from importlib.metadata import PackageNotFoundError, distribution
@@ -16,12 +16,12 @@ from typing import Any, ParamSpec
 import numpy as np
 import pinocchio as pin
 
-from impactopt.errors import check_choice, missing_package
+from impactopt.errors import InputError, check_choice, missing_package
 from impactopt.robots import link_tables
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source
-from impactopt.robots.build import joint_names, lock_joints
-from impactopt.robots.link_tables import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, TOE, standin_model
+from impactopt.robots.build import joint_names, lock_joints, locked_angles
+from impactopt.robots.link_tables import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, TOE, Locked, standin_model
 from impactopt.robots.robot import Robot, Sole, Striker
 
 P = ParamSpec("P")
@@ -41,7 +41,7 @@ arm7, planar_arm, space_arm = map(_preset, (link_tables.arm7, link_tables.planar
 
 
 @_preset
-def talos(**overrides: Any) -> Robot:
+def talos(*, locked: Locked = (), **overrides: Any) -> Robot:
     """PAL Robotics' TALOS: 90 kg, grippers locked, 30 joints and a free-flyer.
 
     * Armature: the SRDF has a rotor inertia of 1e-5 kg m2 and a gear ratio of 100 for every joint, wrists
@@ -55,13 +55,13 @@ def talos(**overrides: Any) -> Robot:
       mean of the tips of the three fingers, which touch first (`FirstTouch`).
     * Posture `half_sitting`: the SRDF's, with the ankles' roll set to 0, as its 1.7 mrad tilt the soles.
 
-    `overrides` go to `Robot.from_urdf`.
+    `locked` joints are so beside the grippers'; `overrides` go to `Robot.from_urdf`.
     """
     folder = example_robots() / "talos_data"
     options: dict[str, Any] = {
         "srdf": folder / "srdf" / "talos.srdf",
         "name": "talos",
-        "locked": ("gripper_left_joint", "gripper_right_joint"),
+        "locked": {"gripper_left_joint": 0.0, "gripper_right_joint": 0.0, **locked_angles(locked)},
         "soles": tuple(
             Sole.box(name=side, frame=f"{side}_sole_link", length=0.20, width=0.12)
             for side in ("left", "right")
@@ -130,7 +130,7 @@ _G1_WAIST = {"waist_yaw": (_7520_14, 17.6), "waist_roll": (2 * _5020, 7.0), "wai
 
 
 @_preset
-def g1(**overrides: Any) -> Robot:
+def g1(*, locked: Locked = (), **overrides: Any) -> Robot:
     """Unitree's G1 with 29 joints and rubber hands: 33 kg.
 
     * Armature: of the motors, 0.0036 to 0.025 kg m2. Also known are their torque-speed lines and friction
@@ -144,7 +144,7 @@ def g1(**overrides: Any) -> Robot:
     * Strikers `right_hand`, `left_hand`: front of the rubber hand's knuckles (its mesh ends at x = 0.132 m).
     * Posture `half_sitting`: knees bent by 0.67 rad, soles flat, elbows bent.
 
-    `overrides` go to `Robot.from_urdf`.
+    `locked` and `overrides` go to `Robot.from_urdf`.
     """
     corners = np.array([[0.12, 0.03], [-0.05, 0.025], [-0.05, -0.025], [0.12, -0.03]])
     posture: dict[str, float] = {}
@@ -157,14 +157,16 @@ def g1(**overrides: Any) -> Robot:
             f"{side}_shoulder_roll_joint": sign * 0.2,
             f"{side}_elbow_joint": 0.6,
         }
-    drives = {
-        f"{side}_{joint}": drive for side in ("left", "right") for joint, drive in _G1_SIDES.items()
-    } | _G1_WAIST
+    locked = locked_angles(locked)
+    drives = {f"{side}_{joint}": drive for side in ("left", "right") for joint, drive in _G1_SIDES.items()}
+    drives = {f"{joint}_joint": drive for joint, drive in (drives | _G1_WAIST).items()}
+    drives = {joint: drive for joint, drive in drives.items() if joint not in locked}
     options: dict[str, Any] = {
         "name": "g1",
-        "armature": {f"{joint}_joint": armature for joint, (armature, _) in drives.items()},
-        "actuators": {f"{joint}_joint": _G1_MOTORS[armature] for joint, (armature, _) in drives.items()},
-        "kd": {f"{joint}_joint": kd for joint, (_, kd) in drives.items()},
+        "locked": locked,
+        "armature": {joint: armature for joint, (armature, _) in drives.items()},
+        "actuators": {joint: _G1_MOTORS[armature] for joint, (armature, _) in drives.items()},
+        "kd": {joint: kd for joint, (_, kd) in drives.items()},
         "soles": tuple(
             Sole(
                 name=side,
@@ -181,7 +183,7 @@ def g1(**overrides: Any) -> Robot:
             )
             for side, sign in (("right", 1.0), ("left", -1.0))
         ),
-        "postures": {"half_sitting": posture},
+        "postures": {"half_sitting": {joint: x for joint, x in posture.items() if joint in drives}},
     }
     return Robot.from_urdf(
         example_robots() / "g1_description" / "urdf" / "g1_29dof_rev_1_0.urdf", **{**options, **overrides}
@@ -210,9 +212,7 @@ _ON_LEFT_FOOT = {  # half sitting, but leaning to the left, with the right foot 
 
 
 @_preset
-def standin(
-    *, floating: bool = True, locked: Iterable[str] | Mapping[str, float] = (), **overrides: Any
-) -> Robot:
+def standin(*, floating: bool = True, locked: Locked = (), **overrides: Any) -> Robot:
     """A stand-in for the paper's robot, HRP-2: 58 kg, 28 joints and a free-flyer. It needs no files.
 
     HRP-2's own description is not public. Torque and velocity limits, gear ratios, rotor inertias and soles
@@ -282,11 +282,14 @@ _PRESETS: dict[str, Callable[..., Robot]] = {
     "arm7": arm7,
     "space_arm": space_arm,
 }
+_ARMS = ("planar_arm", "arm7", "space_arm")
 
 
 def load_robot(name: str, /, **overrides: Any) -> Robot:
     """The preset of that name; `overrides` go to its function, such as `standin`."""
     check_choice("no robot", name, _PRESETS)
+    if "floating" in overrides and name in _ARMS:
+        raise InputError(f"floating: the base of {name!r} is as it is; leave it out, or load a URDF")
     return _PRESETS[name](**overrides)
 
 

@@ -259,8 +259,8 @@ def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Ar
 
     The new program may have more nodes or collocation elements, another collision model, or first instants of
     contact. Variables at nodes are interpolated, and those of the contact sampled from its polynomials. The
-    contact with a duration is guessed anew from an impact without one, and conversely. Multipliers are those
-    of the same constraints and variables, else zero.
+    contact with a duration is guessed anew from an impact without one or a contact with other phases, and
+    conversely. Multipliers are those of the same constraints and variables, else zero.
 
     x, y, z : solver variables (n,), multipliers of constraints (m,) and of bounds (n,) of the old program.
 
@@ -295,6 +295,8 @@ def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Ar
             group.write(new, np.column_stack([np.interp(now, before, column) for column in known.read(x).T]))
         elif known.count == len(old.hit.stages) and known.count != group.count:
             pairs = stages  # `map_stages` writes the variables, below
+        elif (known.count, known.size) != (group.count, group.size):
+            continue  # of the events of another contact
         else:
             group.write(new, known.read(x))
         for i, k in pairs:
@@ -302,9 +304,9 @@ def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Ar
     state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
     for collision, old_collision in zip(t.hit.collisions, old.hit.collisions, strict=True):
         lasts, lasted = (isinstance(each, Collision) for each in (collision, old_collision))
-        if lasts != lasted:
-            collision.guess(new, *state)
-        if not (lasts and lasted):
+        if not (lasts and lasted and len(collision.T) == len(old_collision.T)):
+            if lasts or lasted:
+                collision.guess(new, *state)
             continue
         if t.hit.elements != old.hit.elements:
             map_stages(collision, old_collision, new, x)

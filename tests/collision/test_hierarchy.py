@@ -290,6 +290,12 @@ def test_freezes_are_a_whole_number(freezes):
         SDC(robot=slider(1.0), striker="tip", normal=X, law=LAW, target=TARGET, freezes=freezes)
 
 
+def test_freezes_may_be_an_integer_of_numpy():
+    given = np.arange(3)[2]
+    model = SDC(robot=slider(1.0), striker="tip", normal=X, law=LAW, target=TARGET, freezes=given)
+    assert model.freezes == 2
+
+
 # ------------------------------------------------------------ moving a configuration
 @pytest.mark.parametrize("scale", [1.0, 1e-2, 9e-4, 1e-5, 0.0])
 def test_integrate_moves_as_pinocchio_does(scale):

@@ -132,7 +132,7 @@ TERMS: dict[str, st.SearchStrategy[Any]] = {
     "legs": st.builds(terms.LegExtension, minimum=st.floats(0, 1)),
     "rate": st.builds(
         terms.TorqueRate,
-        limit=POSITIVE | st.dictionaries(st.sampled_from(["elbow", "wrist"]), POSITIVE),
+        limit=POSITIVE | st.dictionaries(st.sampled_from(["elbow", "wrist"]), POSITIVE, min_size=1),
     ),
     "self": st.builds(terms.SelfCollision, margin=SMALL, enabled=st.booleans()),
     "keep": st.builds(terms.KeepOut, margin=SMALL, enabled=st.booleans()),
@@ -227,8 +227,10 @@ def test_any_problem_comes_back(nailing: ImpactProblem, changes: dict[str, Any],
 
 @pytest.mark.parametrize("name", CASES)
 def test_terms_that_only_some_problems_have_come_back(nailing: ImpactProblem, name: str) -> None:
+    motor = impactopt.Actuator(stall_torque=200.0, no_load_speed=10.0)  # for the term that is about motors
+    robot = nailing.robot.with_actuators({"wrist": motor})
     for term in (CASES[name].tight, CASES[name].mild):
-        problem = dataclasses.replace(nailing, terms=(term,))
+        problem = dataclasses.replace(nailing, terms=(term,), robot=robot)
         assert_same(back(write_problem(problem)), problem)
         assert back(write_problem(problem)).terms == (term,)
 

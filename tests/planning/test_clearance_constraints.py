@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
-from impactopt import Ground, ImpactProblem, Obstacle, Solution, Status, load_problem, solve
+from impactopt import Ground, ImpactProblem, KeepOut, Obstacle, Solution, Status, load_problem, solve
 from impactopt.bodies.clearance import Places
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
@@ -181,3 +182,14 @@ def test_a_limit_of_iterations_that_nobody_has_set_is_no_answer(free: Solution) 
     for options, stuck in ((None, True), ({"max_iterations": 5}, False)):
         budget = Budget(solver="ipm", options=options, time_limit=None, callback=None)
         assert PlanSolver(budget=budget, margins=None, refined=True)._stuck(ended) is stuck
+
+
+@pytest.mark.slow
+def test_a_plan_that_loses_most_of_a_clearance_is_not_called_solved() -> None:
+    """The hammer's face goes to 9 mm above this floor, and may not: it drives the nail 6 mm into it."""
+    problem = load_problem("arm_planar")
+    terms = (*problem.terms, KeepOut(margin=0.05))
+    found = solve(dataclasses.replace(problem, ground=Ground(height=0.735), terms=terms))
+    assert found.clearance()["clearance_mm"] < 25
+    assert found.status is not Status.SOLVED
+    assert re.search(r"wrist and ground .* instead of 50 \(\[terms.keep_out\] margin_m", found.result.message)

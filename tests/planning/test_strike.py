@@ -20,7 +20,9 @@ from typer.testing import CliRunner
 from impactopt import (
     AngularMomentum,
     Balance,
+    Board,
     Effort,
+    FreeMass,
     FullDynamics,
     HitCone,
     HitRegion,
@@ -29,6 +31,7 @@ from impactopt import (
     InputError,
     Obstacle,
     PeakForce,
+    Phase,
     Scenario,
     Solution,
     Status,
@@ -483,6 +486,30 @@ def test_a_start_with_other_scenarios_is_refused(plan: Any, arm_plan: Planned) -
         told = f"solution are none, those of the problem {scenarios[0].name}, .*leave start out"
         with pytest.raises(InputError, match=told):
             plan(problem, start=start)
+
+
+def test_a_solution_starts_a_problem_with_another_objective(hammered: Solution) -> None:
+    """Which has a variable of its own."""
+    problem = dataclasses.replace(hammered.problem, objectives=(Impulse(), PeakForce()))
+    found = solve(problem, start=hammered, refine=False)
+    assert found.status is Status.SOLVED and len(found.objectives) == 2
+
+
+@pytest.mark.slow
+def test_a_solution_starts_problems_with_fewer_and_more_phases_of_contact(hammered: Solution) -> None:
+    found = hammered
+    for target in (FreeMass(mass=1.0), Board(mass=0.05, stiffness=1e5, breaking_force=50.0)):
+        problem = dataclasses.replace(hammered.problem, target=target, objectives=(Impulse(),))
+        found = solve(problem, start=found, refine=False)
+        assert found.status is Status.SOLVED
+        assert found.impulse == pytest.approx(found.validate().impulse, rel=0.01)
+
+
+def test_a_start_with_another_mesh_or_stance_is_refused(hammered: Solution) -> None:
+    finer = dataclasses.replace(hammered.problem, swing=Phase(duration=0.8, intervals=14))
+    for problem in (finer, dataclasses.replace(finer, collision="sdc")):
+        with pytest.raises(InputError, match=r"intervals of swing.*: 12, 10, of the problem: 14, 10; give"):
+            solve(problem, start=hammered)
 
 
 # ---- the command

@@ -47,6 +47,12 @@ def test_a_limit_by_joint_is_not_changed_by_its_caller() -> None:
     assert load.limit == {"joint_1": 1.0}
 
 
+def test_an_empty_table_of_limits_is_refused() -> None:
+    for kind in (GearLoad, PowerLimit, VelocityJump):
+        with pytest.raises(InputError, match=f"{kind.__name__}.limit names no joint, and would bound none"):
+            kind(limit={})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("damping", [0.0, 300.0])
@@ -191,6 +197,16 @@ def test_friction_that_takes_all_of_a_motor_is_refused(arm_transcription: Transc
     )
     with pytest.raises(InputError, match="stall torque of elbow is 5 N m, which its friction, 6 N m, takes"):
         changed(arm_transcription, terms=(MotorCurve(fraction=0.5),), robot=robot)
+
+
+@pytest.mark.parametrize("term", [MotorCurve(), PowerLimit()])
+def test_a_bound_on_motors_without_data_is_refused(term: MotorCurve | PowerLimit) -> None:
+    problem = load_problem("arm_planar")
+    data: dict[str, Any] = {"stall_torque": 200.0, "no_load_speed": 10.0, "power_limit": 100.0}
+    known = problem.robot.with_actuators({"elbow": Actuator(**data)})
+    assert replace(problem, terms=(term,), robot=known).terms == (term,)  # of one motor is enough
+    with pytest.raises(InputError, match=r"none of 'planar_arm' is: give their data as .*robot.actuators"):
+        replace(problem, terms=(term,))
 
 
 def test_an_impact_without_duration_has_no_gear_load_but_a_jump(arm_transcription: Transcription) -> None:

@@ -80,6 +80,12 @@ def test_keys_may_leave_their_unit_out_and_name_entries_of_lists() -> None:
     assert key_place(DATA, "scenarios.heavy.mass") == ("scenarios", 1, "mass")
 
 
+def test_keys_of_the_collision_may_leave_their_unit_out() -> None:
+    given = {"duration": [0.0, 0.01], "auto_impulse": 0.1, "auto_zmp": 1.0}
+    data = change_data(DATA, {f"collision.{key}": value for key, value in given.items()})
+    assert data["collision"] == {"duration_s": [0.0, 0.01], "auto_impulse_pct": 0.1, "auto_zmp_mm": 1.0}
+
+
 def test_a_key_of_the_robot_makes_a_section_of_its_preset() -> None:
     data = change_data(DATA, {"robot.kp": 500.0, "robot.torque_limit.elbow": 30.0})
     assert data["robot"] == {

@@ -144,6 +144,29 @@ def test_preset_takes_overrides() -> None:
     assert robot.torque_limit[robot.joint_index("arm_right_4_joint")] == 5
 
 
+@pytest.mark.parametrize(
+    ("preset", "joint"),
+    [
+        ("talos", "head_2_joint"),
+        ("g1", "left_elbow_joint"),
+        ("planar_arm", "wrist"),
+        ("arm7", "joint_4"),
+        ("space_arm", "joint_7"),
+    ],
+)
+def test_presets_lock_the_joints_that_are_named_and_no_others(preset: str, joint: str) -> None:
+    whole, locked = load_robot(preset), load_robot(preset, locked={joint: 0.1})
+    kept = [k for k, name in enumerate(whole.joint_names) if name != joint]
+    assert locked.joint_names == tuple(whole.joint_names[k] for k in kept)
+    for name in ("armature", "torque_limit", "lower", "kp", "kd"):
+        np.testing.assert_array_equal(getattr(locked, name), getattr(whole, name)[kept])
+
+
+def test_an_arm_has_the_base_that_it_has() -> None:
+    with pytest.raises(InputError, match="floating: the base of 'arm7' is as it is; leave it out"):
+        load_robot("arm7", floating=True)
+
+
 def test_unknown_preset() -> None:
     with pytest.raises(InputError, match=r"'taols' \(did you mean 'talos'\?\).*talos, g1"):
         load_robot("taols")

@@ -408,7 +408,7 @@ def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, ba
     violated = clearance_violations(Evaluation(t, x), margins)
     assert violated is not None and 0.02 < violated.depth < 0.1
     bar = -1 - [body.name for body in problem.bodies.world].index("bar")
-    assert {other for _, other in violated.pairs} == {bar}
+    assert {other for _, other in violated.nearest} == {bar}
     assert clearance_violations(Evaluation(program_of(barred, problem), barred.result.x), margins) is None
     depth, pairs = deepest_penetration(t, x, margins)
     assert 0 < depth <= violated.depth + 1e-9 and {other for _, other in pairs} == {bar}

@@ -388,7 +388,7 @@ def _field(section: type[Section], part: str, key: str, where: str) -> tuple[str
     """The full name of a section's key, which may be given without its unit, and its type."""
     names = {info.alias or name: (name, info) for name, info in section.model_fields.items()}
     for known, (name, info) in names.items():
-        if part in (known, name):
+        if part in (known, name) or known in (f"{part}_{unit}" for unit in ("s", "mm", "pct")):
             return known, info.annotation
     near = did_you_mean(part, [*names, *section.model_fields])
     table = f"[{where}]" if where else "a problem file"

@@ -71,6 +71,9 @@ class Term(Described):
         elif about.direction:
             self._keep_direction(field.name)
         elif about.by_joint and isinstance(value, Mapping):
+            if not value:
+                where = f"{type(self).__name__}.{field.name}"
+                raise InputError(f"{where} names no joint, and would bound none; give a limit for one")
             # a copy, as the caller may change the table later, and the term is frozen
             table = {name: self._number(field.name, number, about) for name, number in value.items()}
             object.__setattr__(self, field.name, table)

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_kind, shortened
 from impactopt.kinematics.coordinates import MAX_PITCH, StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
@@ -113,11 +113,19 @@ class Affine:
 
     __rmul__ = __mul__
 
+    def __truediv__(self, divisor: ArrayLike) -> Affine:
+        if isinstance(divisor, Affine):
+            raise InputError("a quotient of affine expressions is not affine: `lift` the output of a block")
+        return self * (1.0 / np.asarray(divisor, dtype=float))
+
     def __neg__(self) -> Affine:
         return self * -1.0
 
     def __sub__(self, other: Affine | ArrayLike) -> Affine:
         return self + (-other if isinstance(other, Affine) else -np.asarray(other, dtype=float))
+
+    def __rsub__(self, other: ArrayLike) -> Affine:
+        return -self + other
 
     def __getitem__(self, index: NDArray[np.intp] | slice) -> Affine:
         keep = np.atleast_1d(np.arange(self.size)[index])
@@ -405,9 +413,20 @@ class Constraints:
         measure : one for all constraints, or one for each.  place : text is a place without a time.
         whole : as of :class:`ConstraintOrigin`. Constraints without a finite bound are dropped.
         """
+        check_kind("term", term, str)
+        spot = Place.plain(place) if isinstance(place, str) else place
+        check_kind(f"{term}: place", spot, Place)
         n = len(components)
-        lo = np.broadcast_to(np.asarray(lower, dtype=float), (n,))
-        hi = np.broadcast_to(np.asarray(upper, dtype=float), (n,))
+        measures = [measure] * n if measure is None or isinstance(measure, Measure) else [*measure]
+        if len(measures) != n or not all(isinstance(each, Measure | None) for each in measures):
+            raise InputError(f"{term}: measure must be a Measure, or one for each component")
+        try:
+            lo, hi = (np.broadcast_to(np.asarray(x, dtype=float), (n,)) for x in (lower, upper))
+        except ValueError:
+            raise InputError(
+                f"{term}: a bound of its {n} constraints is {shortened(repr((lower, upper)))}; "
+                "give one number, or as many as components"
+            ) from None
         if np.isnan([lo, hi]).any():
             raise InputError(f"{term}: a bound of its constraints is NaN; give numbers, or inf for no bound")
         if outputs is None and affine is None:
@@ -431,8 +450,6 @@ class Constraints:
         self.affine.append(lin)
         self.lower.append(lo)
         self.upper.append(hi)
-        spot = Place.plain(place) if isinstance(place, str) else place
-        measures = [measure] * n if measure is None or isinstance(measure, Measure) else measure
         self.origins.extend(
             ConstraintOrigin(term, spot, components[int(k)], measures[int(k)], whole) for k in keep
         )

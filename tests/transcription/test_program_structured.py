@@ -321,8 +321,11 @@ def test_affine_algebra(seed: int) -> None:
     np.testing.assert_allclose(stack([a, Affine.zeros(1), b]).evaluate(x), [*va, 0, *vb], atol=1e-12)
     np.testing.assert_allclose(sum([a, b, 2.0]).evaluate(x), va + vb + 2.0, atol=1e-12)
     np.testing.assert_allclose((m[0, :2] + a - 1.0).evaluate(x), m[0, :2] + va - 1.0, atol=1e-12)
+    np.testing.assert_allclose((1.0 - a / 2.0).evaluate(x), 1.0 - va / 2.0, atol=1e-12)
     with pytest.raises(InputError, match="not affine: `lift`"):
         a * b
+    with pytest.raises(InputError, match="not affine: `lift`"):
+        a / b
     with pytest.raises(ValueError, match="sizes 2 and 3"):
         a + Affine.zeros(3)
 

@@ -1192,6 +1192,16 @@ def test_an_mjcf_of_a_walker_without_a_free_joint_stands(tmp_path: Path) -> None
     assert not draft_robot(xml, mjcf=True, bolted=True).robot.floating
 
 
+def test_a_floating_mjcf_that_does_not_stand_is_bolted_and_told(tmp_path: Path) -> None:
+    """A walker that lies on its back with all joints at zero."""
+    xml = _walker(tmp_path)
+    assert not draft_robot(xml, mjcf=True).fixed
+    xml.write_text(re.sub(r'(<body name="trunk"[^>]*)>', r'\1 euler="90 0 0"><freejoint/>', xml.read_text()))
+    draft = draft_robot(xml, mjcf=True)
+    assert draft.fixed and not draft.robot.floating
+    assert not draft_robot(xml, mjcf=True, bolted=True).fixed
+
+
 def test_robots_of_example_robot_data_go_by_name() -> None:
     pytest.importorskip("pinocchio")
     try:

@@ -67,7 +67,7 @@ class Compiled:
         return [b for b, (joint, _, _) in self.body.items() if b and joint and self.mj.body_mass[b] > 0]
 
     def of_base(self, j: int) -> str:
-        """What acts on the six degrees of freedom of a root from joint j on, in words; "" if nothing does."""
+        """Names of what acts on the six degrees of freedom of a root from joint j on; "" if nothing does."""
         first, names = int(self.mj.jnt_dofadr[j]), ("damping", "frictionloss", "armature")
         own = [name for name in names if self.numbers(f"dof_{name}")[first : first + 6].any()]
         own += ["stiffness"] if np.any(self.mj.jnt_stiffness[j]) else []

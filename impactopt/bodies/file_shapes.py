@@ -14,8 +14,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.solids import Solid, box, capsule, cylinder, find_mesh, lack_of, read_mesh, sphere
-from impactopt.errors import FARTHEST
+from impactopt.errors import FARTHEST, InputError
 from impactopt.robots.mjcf import compile_mjcf
+from impactopt.robots.urdf import parse_urdf
 
 Array = NDArray[np.float64]
 
@@ -36,8 +37,8 @@ class LinkShape:
 def urdf_elements(urdf: str | None, tag: str) -> list[ElementTree.Element]:
     """Elements of a URDF with this tag; none without a URDF, or if it cannot be read."""
     try:
-        return [] if urdf is None else ElementTree.parse(urdf).getroot().findall(tag)
-    except (OSError, ElementTree.ParseError):
+        return [] if urdf is None else parse_urdf(urdf).findall(tag)
+    except (OSError, InputError):
         return []
 
 
@@ -105,6 +106,8 @@ def _urdf_solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | Non
                 return box(numbers(shape.attrib["size"]))
             if shape.tag == "cylinder":
                 return cylinder(*(float(numbers(shape.attrib[key], 1)[0]) for key in ("radius", "length")))
+            if shape.tag == "capsule":
+                return capsule(*(float(numbers(shape.attrib[key], 1)[0]) for key in ("radius", "length")))
             if shape.tag == "sphere":
                 return sphere(float(numbers(shape.attrib["radius"], 1)[0]))
             if shape.tag == "mesh":

@@ -31,7 +31,7 @@ LIMIT_MARGIN = 0.05  # of a joint's range, between a posture at contact and the 
 # postures with estimated impacts, and postures that are drawn for them at most, as most may not face a normal
 POSTURES, MAX_DRAWN = 1000, 20000
 MIN_POSTURES = 100  # with the link behind the target's plane; where there are fewer, others count, too
-POINT_POSTURES = 8  # postures at the hit point of a problem
+POINT_POSTURES = 8  # postures at the hit point of a problem: random ones, and near the hardest impacts
 NEARBY = 0.4  # [m] from a problem's point
 # Attempts of `strongest_posture`. Measured on 17 targets of five arms: the best of 10 leads to a motion for
 # 16 of them, that of 6 for 14.
@@ -316,16 +316,21 @@ def best_share(problem: ImpactProblem) -> tuple[float, EstimatedImpact] | None:
     if p.robot.floating or p.second is not None or not isinstance(p.target, FreeMass):
         return None
     strength = Strength(robot=p.robot, striker=p.striker, law=p.law, target=p.target)
-    rng, postures = np.random.default_rng(0), [p.contact_posture]
-    for _ in range(POINT_POSTURES):
-        guess = pin.integrate(p.robot.model, p.contact_posture, rng.standard_normal(p.robot.nv))
-        with suppress(InputError):
-            postures.append(inverse_kinematics(p.coordinates, p.striker, p.point, guess, starts=1))
-    own = [b.impulse for b in strength.at(np.array(postures), np.tile(p.normal, (len(postures), 1)))]
     drawn = drawn_impacts(
         strength, p.start_posture, (*NORMALS, p.normal), with_face=p.term(FirstTouch).enabled
     )
     near = [impact for impact in drawn if np.linalg.norm(impact.point - p.point) < NEARBY]
+    rng, postures = np.random.default_rng(0), [p.contact_posture]
+    guesses = [
+        pin.integrate(p.robot.model, p.contact_posture, rng.standard_normal(p.robot.nv))
+        for _ in range(POINT_POSTURES)
+    ]
+    # random postures miss the one for which a draft has its target there
+    guesses += [impact.q for impact in near if np.allclose(impact.normal, p.normal)][:POINT_POSTURES]
+    for guess in guesses:
+        with suppress(InputError):
+            postures.append(inverse_kinematics(p.coordinates, p.striker, p.point, guess, starts=1))
+    own = [b.impulse for b in strength.at(np.array(postures), np.tile(p.normal, (len(postures), 1)))]
     if not near or not own or not near[0].impulse > 0:
         return None
     return min(max(own) / near[0].impulse, 1.0), near[0]

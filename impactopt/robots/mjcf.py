@@ -31,6 +31,7 @@ from impactopt.robots.tendons import Tendon
 
 Array = NDArray[np.float64]
 _OUT = "take it out"
+_SPAN = 0.1  # least determinant of three axes that move a body in all directions
 
 
 class Compiled:
@@ -64,6 +65,13 @@ class Compiled:
     def moving(self) -> list[int]:
         """Bodies with mass that a joint of the robot moves."""
         return [b for b, (joint, _, _) in self.body.items() if b and joint and self.mj.body_mass[b] > 0]
+
+    def of_base(self, j: int) -> str:
+        """Names of what acts on the six degrees of freedom of a root from joint j on; "" if nothing does."""
+        first, names = int(self.mj.jnt_dofadr[j]), ("damping", "frictionloss", "armature")
+        own = [name for name in names if self.numbers(f"dof_{name}")[first : first + 6].any()]
+        own += ["stiffness"] if np.any(self.mj.jnt_stiffness[j]) else []
+        return " and ".join(own)
 
     def numbers(self, name: str) -> Array:
         """Array of the compiled model, (count, ...); empty if this MuJoCo has no such array."""
@@ -101,16 +109,9 @@ def notes_of(c: Compiled, gravcomp: Compensation, torque: Mapping[str, float]) -
     if mj.opt.density > 0 or mj.opt.viscosity > 0:
         yield "fluid drag is left out: <option density, viscosity>"
     for j in range(mj.njnt):
-        dofs = slice(int(mj.jnt_dofadr[j]), int(mj.jnt_dofadr[j]) + 6)
-        if c.floating and mj.jnt_bodyid[j] in c.body and mj.jnt_type[j] == c.mujoco.mjtJoint.mjJNT_FREE:
-            own = [
-                name
-                for name in ("damping", "frictionloss", "armature")
-                if c.numbers(f"dof_{name}")[dofs].any()
-            ]
-            own += ["stiffness"] if np.any(mj.jnt_stiffness[j]) else []
-            if own:
-                yield f"{' and '.join(own)} of the free joint {c.name('joint', j)!r}: left out"
+        free = c.floating and mj.jnt_bodyid[j] in c.body and mj.jnt_type[j] == c.mujoco.mjtJoint.mjJNT_FREE
+        if free and (own := c.of_base(j)):
+            yield f"{own} of the free joint {c.name('joint', j)!r}: left out"
     if getattr(mj, "nflex", 0):
         yield "deformable bodies (flex) are left out"
     plugged = [c.name("body", b) for b in c.body if c.numbers("body_plugin")[b : b + 1].max(initial=-1) >= 0]
@@ -424,14 +425,29 @@ class _Reader(Compiled):
         return self.out
 
     def _has_joints(self, root: int) -> bool:
-        """True if the subtree of a root body has joints besides a free one."""
+        """True if the subtree of a root body has joints besides a free one, or the six of `_six`."""
         kinds = self.mj.jnt_type[self.mj.body_rootid[self.mj.jnt_bodyid] == root]
-        return bool((kinds != self.mujoco.mjtJoint.mjJNT_FREE).any())
+        return int((kinds != self.mujoco.mjtJoint.mjJNT_FREE).sum()) > 6 * self._six(root)
 
     def _free(self, b: int) -> bool:
-        """True if the body has a free joint."""
+        """True if the body has a free joint, or six on the ground that move it likewise."""
         first, count = int(self.mj.body_jntadr[b]), int(self.mj.body_jntnum[b])
-        return count > 0 and self.mj.jnt_type[first] == self.mujoco.mjtJoint.mjJNT_FREE
+        free = count > 0 and self.mj.jnt_type[first] == self.mujoco.mjtJoint.mjJNT_FREE
+        return free or self._six(b)
+
+    def _six(self, b: int) -> bool:
+        """True if three slides and three hinges, without limits and motors, move a body on the ground."""
+        mj, first, kinds = self.mj, int(self.mj.body_jntadr[b]), self.mujoco.mjtJoint
+        joints = np.s_[first : first + 6]
+        slides = mj.jnt_type[joints] == kinds.mjJNT_SLIDE
+        if mj.body_parentid[b] != 0 or mj.body_jntnum[b] != 6 or slides.sum() != 3:
+            return False
+        axes = mj.jnt_axis[joints]
+        turns = np.all(mj.jnt_type[joints][~slides] == kinds.mjJNT_HINGE)
+        spans = all(abs(np.linalg.det(axes[some])) > _SPAN for some in (slides, ~slides))
+        driven = mj.actuator_trnid[mj.actuator_trntype == self.mujoco.mjtTrn.mjTRN_JOINT, 0]
+        held = mj.jnt_limited[joints].any() or np.isin(driven, np.arange(first, first + 6)).any()
+        return bool(turns and spans and not held)
 
     def _add_body(self, b: int) -> None:
         """Add a body with its joints, in the order of the file, to the one that its parent hangs on."""
@@ -441,9 +457,13 @@ class _Reader(Compiled):
         first, count = int(mj.body_jntadr[b]), int(mj.body_jntnum[b])
         free = self._free(b)
         if self.floating and b == self.roots[0]:
-            name = self.name("joint", first) if free else "root_joint"
+            name = self.name("joint", first) if free and count == 1 else "root_joint"
             joint, place = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), name), _none()
             above = model.addJointFrame(joint, 0)
+        if self.floating and free and count > 1:
+            names = ", ".join(self.name("joint", j) for j in range(first, first + count))
+            note = f"joints {names} are read as a free joint of body {self.name('body', b)!r}"
+            self.out.notes.append(note + (f", {own} left out" if (own := self.of_base(first)) else ""))
         for j in () if free else range(first, first + count):
             at = pin.SE3(np.eye(3), np.array(mj.jnt_pos[j]))
             joint, above, turn = self._add_joint(j, joint, place * at, above)
@@ -595,9 +615,11 @@ class _Reader(Compiled):
             angles = [float(mj.key_qpos[k][mj.jnt_qposadr[j]]) for j in self.joint]
             JointAngles([self.model.joints[i] for i in self.joint.values()]).put(q, angles)
             if self.floating and self._free(self.roots[0]):
-                start = int(mj.jnt_qposadr[int(mj.body_jntadr[self.roots[0]])])
-                where = mj.key_qpos[k][start : start + 7]
-                q[:7] = pin.SE3ToXYZQUAT(_placement(where[:3], where[3:]))
+                data = self.mujoco.MjData(mj)
+                data.qpos = mj.key_qpos[k]
+                self.mujoco.mj_kinematics(mj, data)
+                root = self.roots[0]
+                q[:7] = pin.SE3ToXYZQUAT(_placement(data.xpos[root], data.xquat[root]))
             self.model.referenceConfigurations[self.name("key", k)] = q
 
 

@@ -7,6 +7,7 @@ change the dynamics become ties or notes of the `Description`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from copy import deepcopy
 from os import PathLike
 from pathlib import Path
 from xml.etree.ElementTree import Element, TreeBuilder, tostring
@@ -44,7 +45,7 @@ def read_urdf(
     """
     urdf = existing(path, "URDF")
     joints = (pin.JointModelFreeFlyer(),) if floating else ()
-    root = _parsed(urdf)
+    root = parse_urdf(urdf)
     if any(tag.tag.startswith("xacro:") for tag in root.iter()):
         raise InputError(
             f"{urdf} is a xacro file, not yet a URDF: run `xacro {Path(urdf).name} > robot.urdf`, and give "
@@ -52,10 +53,7 @@ def read_urdf(
         )
     _check_joints(root, urdf)
     try:
-        if _without_negative_limits(root):
-            model = pin.buildModelFromXML(tostring(root, encoding="unicode"), *joints)
-        else:
-            model = pin.buildModelFromUrdf(urdf, *joints)
+        model = pin.buildModelFromXML(tostring(_for_pinocchio(root), encoding="unicode"), *joints)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
     _check_links(root, urdf, moments=not repaired)
@@ -75,8 +73,13 @@ def read_urdf(
     return out
 
 
-def _parsed(urdf: str) -> Element:
-    """Root element of a URDF."""
+def parse_urdf(urdf: str) -> Element:
+    """Root element of a URDF.
+
+    Raises
+    ------
+    InputError : it is not well-formed.
+    """
     # files may have tags of other tools with undeclared prefixes, hence a parser without namespaces
     parser, tree = ParserCreate(), TreeBuilder()
     parser.StartElementHandler, parser.EndElementHandler = tree.start, tree.end
@@ -90,10 +93,10 @@ def _parsed(urdf: str) -> Element:
 
 
 def _check_joints(root: Element, urdf: str) -> None:
-    """InputError with all joints that lack a limit of effort or velocity, without which no URDF is read, and
-    with those whose axis is zero, which Pinocchio reads as joints that move nothing.
+    """InputError with all joints that lack a limit of effort or velocity, or close a loop, with which no URDF
+    is read, and with those whose axis is zero, which Pinocchio reads as joints that move nothing.
     """
-    found = Mistakes()
+    found, parents = Mistakes(), dict[str, str]()
     for joint in root.findall("joint"):
         limits, kind = joint.findall("limit"), joint.get("type", "")
         name = f"URDF {urdf}: joint {joint.get('name', '')!r}"
@@ -104,27 +107,32 @@ def _check_joints(root: Element, urdf: str) -> None:
         if lacks:
             keys = " and ".join(lacks)
             found.found.append(f"{name} has no {keys} in a <limit>; give {keys} there, 0 if unknown")
+        for child in (element.get("link", "") for element in joint.findall("child")):
+            if child in parents:
+                found.found.append(f"{name} moves link {child!r}, as {parents[child]!r} does; take one out")
+            parents[child] = joint.get("name", "")
         axis = " ".join(axis.get("xyz", "") for axis in joint.findall("axis")).split()
         if kind in ("revolute", "continuous", "prismatic") and axis and not any(map(_urdf_number, axis)):
             found.found.append(f"{name} has the axis {' '.join(axis)}; give its direction, as 0 0 1")
     found.raise_if_any(f"URDF {urdf}")
 
 
-def _without_negative_limits(root: Element) -> bool:
-    """Set negative limits of torque and speed, which stand for none as in SDF, to 0; True if there are any.
+def _for_pinocchio(root: Element) -> Element:
+    """Copy of a URDF that Pinocchio reads.
 
-    Pinocchio refuses them.
+    Negative limits of torque and speed, which stand for none as in SDF, are 0; without capsules, which its
+    parser calls errors.
     """
-    negative = [
-        (limit, key)
-        for joint in root.findall("joint")
-        for limit in joint.findall("limit")
-        for key in ("effort", "velocity")
-        if _urdf_number(limit.get(key, "")) < 0
-    ]
-    for limit, key in negative:
-        limit.set(key, "0")
-    return bool(negative)
+    out = deepcopy(root)
+    for limit in out.findall("joint/limit"):
+        for key in ("effort", "velocity"):
+            if _urdf_number(limit.get(key, "")) < 0:
+                limit.set(key, "0")
+    for link in out.findall("link"):
+        for shape in (*link.findall("visual"), *link.findall("collision")):
+            if shape.find("geometry/capsule") is not None:
+                link.remove(shape)
+    return out
 
 
 def _mimics(root: Element, model: pin.Model) -> Iterator[Tie]:

@@ -155,6 +155,29 @@ def test_the_box_of_an_inertia_that_stands_for_none_is_no_lighter_than_foam() ->
     np.testing.assert_allclose((box.max(axis=0) + box.min(axis=0)) / 2, [0.1, 0.0, 0.0], atol=1e-9)
 
 
+def test_a_capsule_is_a_body(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Its length is that of its line, as in Drake and newer versions of the format."""
+    text, path = urdfs.arm(), tmp_path / "arm.urdf"
+    round_ = text.replace('<box size="0.08 0.08 0.3"/>', '<capsule radius="0.04" length="0.22"/>')
+    assert round_ != text
+    path.write_text(round_)
+    pieces = bodies_of(Robot.from_urdf(path, floating=False, armature=0.01)).pieces
+    size = next(np.ptp(piece.vertices, axis=0) for piece in pieces if piece.link == "elbow_link")
+    assert size == pytest.approx([0.08, 0.08, 0.3], abs=1e-3)
+    assert capfd.readouterr().err == ""
+
+
+def test_shapes_beside_tags_of_other_tools_are_bodies(tmp_path: Path) -> None:
+    """With prefixes that no one declares, as many exporters write."""
+    path, sizes = tmp_path / "arm.urdf", []
+    for more in ("", '<drake:collision_filter_group name="hand"/>'):
+        path.write_text(urdfs.arm().replace("</robot>", f"{more}</robot>"))
+        robot = Robot.from_urdf(path, floating=False, armature=0.01)
+        sizes.append({piece.link: np.ptp(piece.vertices, axis=0) for piece in bodies_of(robot).pieces})
+    assert sizes[0].keys() == sizes[1].keys()
+    assert all(sizes[1][link] == pytest.approx(sizes[0][link]) for link in sizes[0])
+
+
 def test_a_disc_of_many_corners_is_a_body(tmp_path: Path) -> None:
     """The fan of triangles on its face has one corner in all of them, more than coal counts."""
     turn = np.linspace(0.0, 2 * np.pi, 900, endpoint=False)

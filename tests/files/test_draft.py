@@ -239,6 +239,22 @@ def test_a_hand_waits_ahead_of_its_shoulder_wherever_on_its_axis_a_joint_is_give
     assert there[0][1] < -0.15 and there[1] == pytest.approx(there[0], abs=0.02)
 
 
+def test_a_hand_waits_ahead_of_its_shoulder_wherever_a_joint_rolls_the_upper_arm(tmp_path: Path) -> None:
+    """The same motions of an upper arm that turns at the shoulder, and of one that is split in the middle."""
+    there = []
+    for split in (0.0, 0.14):
+        arm = (
+            ("shoulder_pitch", "0 1 0", (0.0, 0.0, 0.4), (-2.8, 2.8), 0.05),
+            ("shoulder_roll", "1 0 0", (0.0, 0.25, 0.0), (-1.5, 1.5), 0.1),
+            ("upper_roll", "0 0 1", (0.0, 0.0, -split), (-1.5, 1.5), 0.1),
+            ("elbow", "0 1 0", (0.0, 0.0, split - 0.28), (-2.4, 0.0), 0.25),
+            ("wrist", "0 0 1", (0.0, 0.0, -0.3), (-1.5, 1.5), 0.1),
+        )
+        problem = _problem(tmp_path, urdfs.biped(arm=arm))
+        there.append(striking_point(problem.robot, problem.striker, problem.start_posture))
+    assert there[0][1] < -0.15 and there[1] == pytest.approx(there[0], abs=0.02)
+
+
 @pytest.mark.slow
 def test_an_elbow_that_drives_no_nail_is_told_why_its_strikes_fail(tmp_path: Path) -> None:
     """A posture in front, which its one joint has not either, is not what it lacks."""
@@ -1174,6 +1190,16 @@ def test_an_mjcf_of_a_walker_without_a_free_joint_stands(tmp_path: Path) -> None
     assert robot["floating"] is True and len(robot["soles"]) == 2
     assert any("no free joint" in line for line in draft.said)
     assert not draft_robot(xml, mjcf=True, bolted=True).robot.floating
+
+
+def test_a_floating_mjcf_that_does_not_stand_is_bolted_and_told(tmp_path: Path) -> None:
+    """A walker that lies on its back with all joints at zero."""
+    xml = _walker(tmp_path)
+    assert not draft_robot(xml, mjcf=True).fixed
+    xml.write_text(re.sub(r'(<body name="trunk"[^>]*)>', r'\1 euler="90 0 0"><freejoint/>', xml.read_text()))
+    draft = draft_robot(xml, mjcf=True)
+    assert draft.fixed and not draft.robot.floating
+    assert not draft_robot(xml, mjcf=True, bolted=True).fixed
 
 
 def test_robots_of_example_robot_data_go_by_name() -> None:

@@ -511,6 +511,25 @@ def test_a_scene_that_mujoco_refuses_is_said(planned: Planned, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("shape", ['<box size="0 0 0"/>', '<sphere radius="0"/>'])
+def test_a_shape_without_size_is_not_drawn_in_the_scene(planned: Planned, tmp_path: Path, shape: str) -> None:
+    """As many files have for links that are only frames."""
+    red = '<material name="red"><color rgba="1 0 0 1"/></material>'
+    drawn = "".join(
+        f"<visual><geometry>{one}</geometry>{colour}</visual>"
+        for one, colour in ((shape, ""), ('<box size=".1 .1 .1"/>', red))
+    )
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm"><link name="plate">{drawn}</link></robot>')
+    robot = planned.problem.robot
+    model = robot.model.copy()
+    model.addFrame(pin.Frame("plate", 1, 0, pin.SE3.Identity(), pin.FrameType.BODY))
+    robot = dataclasses.replace(robot, model=model, urdf=str(tmp_path / "arm.urdf"))
+    problem = dataclasses.replace(planned.problem, robot=robot)
+    export_planned(dataclasses.replace(planned, problem=problem), "mujoco", tmp_path / "scene")
+    scene = mujoco.MjModel.from_xml_path(str(tmp_path / "scene" / "scene.xml"))
+    assert scene.nmesh == 2  # the box and the hammer
+
+
 def frames_in_mujoco(robot: Robot, problem: ImpactProblem, motion: Any) -> list[dict[str, Array]]:
     """Places and velocities of the file's bodies at some frames, by MuJoCo's kinematics of its joints."""
     model = build_world(robot, scene_of(problem), Perturbation(), MujocoOptions())

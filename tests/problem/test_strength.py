@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,13 @@ import pinocchio as pin
 import pytest
 from support import urdfs
 
-from impactopt import FirstTouch, HandOrientation, Robot, Striker, load_problem, solve
+from impactopt import FirstTouch, FreeMass, HandOrientation, Robot, SpringDamper, Striker, load_problem, solve
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import (
     MAX_BEYOND,
     Strength,
+    best_share,
     drawn_impacts,
     random_postures,
     strongest_posture,
@@ -110,3 +112,18 @@ def test_joints_far_from_zero_are_drawn_in_their_ranges(tmp_path: Path) -> None:
     )
     drawn = np.ravel(list(random_postures(robot, "tip", robot.posture("middle"), 20)))
     assert drawn.min() >= 4.0 and drawn.max() <= 6.0 and np.ptp(drawn) > 1.0
+
+
+def test_of_the_hardest_impact_nearby_it_is_said_that_none_is_harder() -> None:
+    """An arm with a joint to spare reaches the point in many postures, of which few are so strong."""
+    problem = replace(
+        load_problem("arm7"), target=FreeMass(mass=3.0), law=SpringDamper(stiffness=1e4, damping=230.0)
+    )
+    for _ in range(5):
+        found = best_share(problem)
+        assert found is not None
+        share, best = found
+        if np.allclose(best.point, problem.point) and np.allclose(best.normal, problem.normal):
+            break
+        problem = replace(problem, point=best.point, normal=best.normal)
+    assert np.allclose(best.point, problem.point) and share == pytest.approx(1.0)

@@ -223,6 +223,11 @@ FREE = MJCF.replace(
     '<body name="one" pos="0 0 1">',
     '<body name="base" pos="0 0 1"><joint name="root" type="free"/><geom size=".1"/><body name="one">',
 ).replace("</worldbody>", "</body></worldbody>")
+SIX = "".join(
+    f'<joint type="{kind}" axis="{axis}"/>'
+    for kind in ("slide", "hinge")
+    for axis in ("1 0 0", "0 1 0", "0 0 1")
+)
 CLOTH = (
     '<flexcomp type="grid" count="3 3 1" spacing=".1 .1 .1" pos="2 0 0" name="cloth" dim="2" radius=".01" '
     'rigid="true"/>'
@@ -312,6 +317,13 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
 MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
     "`<inertial>`": ([('name="g"', 'name="g" density="500"')], ""),
     "`<joint>` of type hinge": ([(J2, 'name="j2" pos=".1 0 0" axis')], ""),
+    "three slides": (
+        [
+            ('<body name="one" pos="0 0 1">', f'<body name="base">{SIX}<geom size=".1"/><body name="one">'),
+            _before("</worldbody>", "</body>"),
+        ],
+        "are read as a free joint of body 'base'",
+    ),
     "`<joint>` with `armature`": ([(J2, f'armature=".1" {J2}')], ""),
     "`<joint>` with `damping`": ([(J2, f'damping="2" frictionloss="1" {J2}')], ""),
     "`forcerange`": ([('kp="100"', 'kp="100" forcerange="-9 9"')], ""),

@@ -106,6 +106,25 @@ def test_a_joint_whose_axis_is_zero_is_named(tmp_path: Path) -> None:
         Robot.from_urdf(path, floating=False)
 
 
+def test_a_joint_that_closes_a_loop_is_named(tmp_path: Path) -> None:
+    """Pinocchio names another link, and none of the joints."""
+    path, loop = (
+        tmp_path / "arm.urdf",
+        urdfs.joint("rod", "wrist_link", "elbow_link", "0 1 0", (0, 0, 0), (-1, 1)),
+    )
+    path.write_text(urdfs.arm().replace("</robot>", f"{loop}</robot>"))
+    with pytest.raises(InputError, match=r"'rod' moves link 'elbow_link', as 'elbow' does; take one out"):
+        Robot.from_urdf(path, floating=False)
+
+
+def test_a_urdf_of_another_encoding_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    text = urdfs.arm().replace('"elbow"', '"geänderter"')
+    path.write_bytes(f'<?xml version="1.0" encoding="ISO-8859-1"?>{text}'.encode("latin-1"))
+    robot = Robot.from_urdf(path, floating=False, armature=0.01)
+    assert "geänderter" in robot.joint_names
+
+
 def test_repairs_have_to_be_said_and_are_listed(tmp_path: Path) -> None:
     path = tmp_path / "walker.urdf"
     path.write_text(urdfs.biped(moments=LOST))

@@ -242,6 +242,55 @@ def test_a_free_joint_can_be_taken_out(tree: Path) -> None:
     assert data.oMf[robot.model.getFrameId("trunk")].translation == pytest.approx([0.1, 0.2, 1.0])
 
 
+SIX = "".join(
+    f'<joint name="base_{kind}{k}" type="{kind}" axis="{axis}" armature="0" frictionloss="0"/>'
+    for kind in ("slide", "hinge")
+    for k, axis in enumerate(("1 0 0", "0 0 1", "0 -1 0"))
+)
+
+
+def test_six_joints_that_move_a_root_like_a_free_one_are_one(tree: Path, tmp_path: Path) -> None:
+    """As in models that stem from OpenSim; a thing beside the robot on six such joints is no robot."""
+    text = TREE.replace('<freejoint name="root"/>', SIX).replace("<freejoint/>", SIX.replace("base", "ball"))
+    home = ".1 .2 .3 .4 .5 .6 .3 .2 0.1 2 2 0 1 1 0 0"
+    text = re.sub(
+        r"<keyframe>.*</keyframe>", f'<keyframe><key name="home" qpos="{home}"/></keyframe>', text, flags=re.S
+    )
+    path = tmp_path / "six.xml"
+    path.write_text(text)
+    read, free = read_mjcf(path), read_mjcf(tree)
+    assert read.model.nq == free.model.nq and "read as a free joint of body 'trunk', damping left out" in str(
+        read.notes
+    )
+    rng = np.random.default_rng(0)
+    q = pin.integrate(free.model, pin.neutral(free.model), rng.standard_normal(free.model.nv))
+    masses = [np.array(pin.crba(m, m.createData(), q)) for m in (read.model, free.model)]
+    assert masses[0] == pytest.approx(masses[1])
+    mj = mujoco.MjModel.from_xml_path(str(path))
+    there = mujoco.MjData(mj)
+    mujoco.mj_resetDataKeyframe(mj, there, 0)
+    mujoco.mj_kinematics(mj, there)
+    data = read.model.createData()
+    pin.framesForwardKinematics(read.model, data, read.model.referenceConfigurations["home"])
+    for body in ("trunk", "hand", "top"):
+        at = data.oMf[read.model.getFrameId(body)].translation
+        assert at == pytest.approx(there.body(body).xpos, abs=1e-9), body
+    assert "ball" not in [frame.name for frame in read.model.frames]
+
+
+@pytest.mark.parametrize("held", ['<motor joint="base_slide1"/>', ""], ids=["driven", "limited"])
+def test_six_joints_with_a_motor_or_a_limit_are_six(tmp_path: Path, held: str) -> None:
+    text = TREE[: TREE.index("<keyframe>")] + "</mujoco>"
+    text = text.replace('<freejoint name="root"/>', SIX).replace("<actuator>", f"<actuator>{held}")
+    if not held:
+        text = text.replace('name="base_hinge0"', 'name="base_hinge0" range="-30 30"')
+    (tmp_path / "six.xml").write_text(
+        text.replace('<body name="ball" pos="2 0 1"><freejoint/><geom size=".1"/></body>', "")
+    )
+    read = read_mjcf(tmp_path / "six.xml")
+    assert read.model.existJointName("base_slide0") and read.model.nv == 10
+
+
 def test_own_numbers_win_over_the_files(tree: Path) -> None:
     robot = Robot.from_mjcf(tree, locked=["turn"], velocity_limit=4.0, torque_limit=7.0, kp={"lift": 5.0})
     assert (robot.torque_limit == 7.0).all() and robot.kp[robot.joint_index("lift")] == 5.0

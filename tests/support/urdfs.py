@@ -79,12 +79,14 @@ def biped(
     pairs: int = 1,
     arms: bool = True,
     inward: float = 0.0,
+    arm: Sequence[tuple[str, str, Sequence[float], tuple[float, float], float]] = _ARM,
 ) -> str:
     """Two legs of so many joints with box feet, and two arms of three.
 
     without : one of these joints.  waist : one more joint, from the trunk to both legs.
     behind : its root looks along -x.  moments : of the right elbow's link.  effort : of all joints [N m].
     pairs : of legs, one behind the other.  arms : False: none.  inward [m] : of the feet, from the ankles.
+    arm : name, axis, place, limits and length of each joint of an arm.
     """
     sign = -1.0 if behind else 1.0
     parts = [link("trunk", 15.0, (0.2, 0.3, 0.5), (0.0, 0.0, 0.25))]
@@ -109,7 +111,7 @@ def biped(
                 parent = child
     for side, out in (("left", sign), ("right", -sign)) if arms else ():
         parent = "trunk"
-        for name, axis, (x, y, z), limits, long in _ARM:
+        for name, axis, (x, y, z), limits, long in arm:
             child = f"{side}_{name}_link"
             turn = " ".join(str(sign * float(a)) for a in axis.split())
             own = moments if child == "right_elbow_link" else ""

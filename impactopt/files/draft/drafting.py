@@ -632,6 +632,11 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
     yield f"{robot.name}: {joints} joints, {stands}; {striker!r} strikes"
     if drafted.freed:
         yield "the MJCF has no free joint: it stands on its two legs here; --bolted leaves it bolted"
+    if drafted.fixed:
+        yield (
+            "the MJCF's free joint is taken out: no two legs are found below its root, z up, with all joints "
+            "at zero"
+        )
     across = [sole["name"] for sole in data["robot"].get("soles", ()) if _wide(sole["polygon_m"])]
     if across:
         yield f"soles that are longer across than ahead: {', '.join(across)}; look at the feet's shapes"

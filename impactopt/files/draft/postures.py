@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
+from impactopt.files.draft.strikers import ROLLS
 from impactopt.problem.strength import drawn_ranges
 from impactopt.robots.build import neutral
 from impactopt.robots.checks import LEG
@@ -168,7 +169,8 @@ def arm_length(robot: Robot, arm: Limb, striker: str) -> float:
 def _upper(robot: Robot, arm: Limb) -> int:
     """Index of the last of an arm's own joints before its first long link.
 
-    Only the part of a link that one of these joints turns counts: if the first joint turns about the line
+    A link ends at the next joint that bends the arm: joints that roll about the link are a part of it. Only
+    the part of a link that one of the joints before it turns counts: if the first joint turns about the line
     through both shoulders, its link along that line is a part of the shoulder.
     """
     model, data = robot.model, robot.model.createData()
@@ -181,12 +183,22 @@ def _upper(robot: Robot, arm: Limb) -> int:
         ]
         for joint in arm.own
     ]
-    steps = np.diff(places, axis=0)
-    length = sum(map(np.linalg.norm, steps))
+    length = sum(map(np.linalg.norm, np.diff(places, axis=0)))
+    links = []
+    for k, start in enumerate(places[:-1]):
+        end = k + 1
+        while end + 1 < len(places) and all(_along(axes[end], p - start) for p in places[end : end + 2]):
+            end += 1
+        links.append(places[end] - start)
     turned = (
-        max(np.linalg.norm(np.cross(axis, step)) for axis in axes[: k + 1]) for k, step in enumerate(steps)
+        max(np.linalg.norm(np.cross(axis, link)) for axis in axes[: k + 1]) for k, link in enumerate(links)
     )
     return next((k for k, part in enumerate(turned) if part > UPPER_ARM * length), 0)
+
+
+def _along(axis: Array, link: Array) -> bool:
+    """True if a joint with an axis (3,) rolls about a link (3,)."""
+    return bool(abs(axis @ link) > ROLLS * np.linalg.norm(link))
 
 
 def _leg(

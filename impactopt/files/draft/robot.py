@@ -36,6 +36,7 @@ class Drafted:
     options : of `Robot.from_urdf` or `Robot.from_mjcf`.  locked : reasons, by locked joint.
     wrong : messages about non-physical inertias, which are repaired here.
     pieces : convex hulls of the links, by the joint that moves them.
+    fixed : True if its MJCF has a free joint, but no legs to stand on.
     """
 
     robot: Robot
@@ -47,6 +48,7 @@ class Drafted:
     legs: tuple[Limb, ...]
     arms: tuple[Limb, ...]
     pieces: Mapping[int, tuple[Piece, ...]] = field(repr=False)
+    fixed: bool = False
 
     @property
     def mjcf(self) -> bool:
@@ -138,7 +140,8 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
         arms = arms_of(found.robot.model, legs)
     if not arms and not legs:
         raise InputError(f"{path}: there is no limb to strike with")
-    return replace(found, legs=legs, arms=arms)
+    fixed = mjcf and not legs and not bolted and is_floating(read_mjcf(path).model)
+    return replace(found, legs=legs, arms=arms, fixed=fixed)
 
 
 def _coupled_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:

@@ -37,6 +37,7 @@ SCENE, REFERENCE, PLAYER, MESHES = "scene.xml", "reference.npz", "play.py", "mes
 MAX_STEP = 2e-4  # [s]
 HAND_MASS = 1.0  # [kg] for the contact's fastest time, if the target is heavier
 MAX_TRIANGLES, CELL = 20_000, 0.004  # of a mesh, and the cells [m] to which a finer one is simplified
+MIN_VERTICES = 4  # of a mesh, by MuJoCo
 TARGET_COLOUR, WORLD_COLOUR = (0.72, 0.55, 0.35, 1.0), (0.6, 0.6, 0.65, 0.35)
 # contact force [N] at a penetration x [m] and its rate [m/s]; negative values are replaced by zero
 LAWS: Mapping[type[ContactLaw], str] = {
@@ -170,6 +171,8 @@ def _draw_robot(mujoco: Any, spec: Any, bodies: list[Any], export: Export, meshe
     for k, ((joint, colour), solid) in enumerate(joined_visuals(export.robot).items()):
         if len(solid.triangles) > MAX_TRIANGLES:
             solid = simplified(solid, CELL)
+        if len(np.unique(solid.vertices.astype(np.float32), axis=0)) < MIN_VERTICES:
+            continue  # nothing to see, such as a box without size
         name = f"{k:02d}"
         _write_stl(meshes / f"{name}.stl", solid)
         # inertia of a shell, as MuJoCo refuses meshes without volume

@@ -302,6 +302,13 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
 
 
 @pytest.mark.slow
+def test_a_smoothed_motion_keeps_velocity_limits_between_its_steps(arm: Solution, tmp_path: Path) -> None:
+    _, path = arm.export("csv", tmp_path / "csv", smooth=(40.0, 2000.0), rate=5000.0)
+    ratio = np.abs(from_csv(path, arm.problem.robot).v) / arm.problem.robot.velocity_limit
+    assert 0.99 < ratio.max() <= 1 + 1e-9  # it is at a limit
+
+
+@pytest.mark.slow
 def test_a_smoothed_motion_that_presses_on_is_told(arm: Solution, tmp_path: Path) -> None:
     """Low accelerations brake behind the target's surface: what the arm presses there is no impact."""
     meta, path = arm.export("csv", tmp_path / "csv", smooth=(15.0, 2000.0))
@@ -309,6 +316,12 @@ def test_a_smoothed_motion_that_presses_on_is_told(arm: Solution, tmp_path: Path
     whole = replayed(arm.problem, from_csv(path, arm.problem.robot)).impulse
     assert told["pressing_Ns"] > 0.1 * whole and told["pressing_ms"] > 50
     assert told["impulse_Ns"] + told["pressing_Ns"] == pytest.approx(whole, rel=2 * NEAR)
+    # what is expected is this motion's, not the plan's, whose impulse is larger
+    _, fine = arm.export("csv", tmp_path / "fine", smooth=(15.0, 2000.0), rate=20_000.0)
+    columns = read_csv(fine)
+    force = np.trapezoid(columns["force [N]"], columns["time [s]"])
+    expected = json.loads(meta.read_text())["expected"]
+    assert force == pytest.approx(whole, rel=2 * NEAR) == expected["impulse_Ns"] != arm.impulse
     with pytest.raises(InputError, match=r"brakes too late: .* then presses on it"):
         arm.export("csv", tmp_path / "late", smooth=(30.0, 500.0))
 

@@ -30,7 +30,7 @@ from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation import simulate
-from impactopt.simulation.result import MAX_GAP, parts_from
+from impactopt.simulation.result import MAX_GAP, Simulation, parts_from
 from impactopt.solvers.program import Status
 from impactopt.transcription.plan import Trajectory
 
@@ -109,6 +109,7 @@ def _check_replaceable(directory: Path, to: str) -> None:
 Array = NDArray[np.float64]
 MIN_RATE, MAX_RATE = 1.0, 1e5  # [Hz]
 PHASES = ("swing", "contact", "follow-through")
+EXPECTED = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -164,7 +165,6 @@ class Export:
         p, robot, s = self.problem, self.robot, self.planned.record.summary
         striker = robot.striker(p.striker)
         frame = robot.model.frames[robot.model.getFrameId(striker.model_frame)]
-        expected = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
         return plain(
             {
                 "problem": p.name,
@@ -205,7 +205,7 @@ class Export:
                     "link": body_name(robot, int(frame.parentJoint)),
                     "point_m": np.array(frame.placement.translation),
                 },
-                "expected": {name: s.get(name) for name in expected},
+                "expected": {name: s.get(name) for name in EXPECTED},
                 "support_polygon_m": self.planned.record.arrays["polygon"],
                 "versions": {**s.get("versions", {}), "export": __version__},
             }
@@ -245,17 +245,22 @@ def export_of(
     Raises
     ------
     InputError : the plan is not solved; joints that are no permutation of the robot's; a rate out of range;
-        a robot on soles without gravity, or smoothed; limits that no motion satisfies, or none that hits.
+        a robot that is not bolted, without gravity or smoothed; limits that no motion satisfies, or none that
+        hits.
     """
     robot = planned.problem.robot
     order = check_export(planned.record.summary.get("status"), robot, rate, joints)
     smoothing: dict[str, float] | None = None
     if smooth is not None:
-        planned, smoothing = _smoothed(planned, smooth)
+        planned, smoothing, replayed = _smoothed(planned, smooth)
     reference, missed = planned.reference, planned.missed
     if not gravity:
         reference = _without_gravity(reference, robot)
         missed = None if missed is None else _without_gravity(missed, robot)
+    motion = motion_at(reference, robot, rate, order, planned.record.arrays, jumps=smooth is None)
+    if smooth is not None:
+        force = np.interp(motion.time, replayed.contact_time, replayed.contact_force)
+        motion = dataclasses.replace(motion, force=force)
     return Export(
         planned=planned,
         joints=tuple(robot.joint_names[k] for k in order),
@@ -263,14 +268,14 @@ def export_of(
         rate=rate,
         gravity=gravity,
         smooth=smoothing,
-        motion=motion_at(reference, robot, rate, order, planned.record.arrays, jumps=smooth is None),
+        motion=motion,
         missed=None if missed is None else motion_at(missed, robot, rate, order, {}),
     )
 
 
-def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, dict[str, float]]:
+def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, dict[str, float], Simulation]:
     """The plan with a smoothed reference and without its abort motion, which would begin with a jump; limits
-    and impulses of the smoothed motion in a replay.
+    and impulses of the smoothed motion in a replay; the replay, whose contact the plan's summary has.
 
     A motion that cannot brake at contact has its reference behind the target, and presses on it after the
     impact. That impulse is `pressing_Ns`; `pressing_ms` is the time from the impact to the last contact.
@@ -316,15 +321,21 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
         "touches": len(replayed.touched),
         "feed_forward_ratio": float(ratio.max()),
     }
-    return dataclasses.replace(planned, reference=reference, missed=None), smoothing
+    record, limit = planned.record, planned.problem.robot.torque_limit
+    report = replayed.report(
+        torque_limit=limit, polygon=record.arrays["polygon"], planned_impulse=smoothing["planned_impulse_Ns"]
+    )
+    summary = {**record.summary, **{name: report[name] for name in EXPECTED}}
+    record = dataclasses.replace(record, summary=summary)
+    return dataclasses.replace(planned, record=record, reference=reference, missed=None), smoothing, replayed
 
 
 def _without_gravity(reference: Trajectory, robot: Robot) -> Trajectory:
     """The reference with feed-forward less g(q), for joints with a motor."""
     if robot.floating:
         raise InputError(
-            "gravity: the torques of a robot on soles depend on the contact forces, so gravity's part of "
-            "them is not defined; leave it at its default"
+            "gravity: only torques of a bolted robot have a part for gravity alone; those of a robot on soles "
+            "depend on the contact forces: leave it at its default"
         )
     model, data = robot.model, robot.model.createData()
     weight = np.array([pin.computeGeneralizedGravity(model, data, q) for q in reference.q])

@@ -334,7 +334,7 @@ def _without_gravity(reference: Trajectory, robot: Robot) -> Trajectory:
     """The reference with feed-forward less g(q), for joints with a motor."""
     if robot.floating:
         raise InputError(
-            "gravity: only torques of a bolted robot have a part for gravity alone; those of a robot on soles "
+            "gravity: only torques of a bolted robot have a part for gravity alone, those of one on soles "
             "depend on the contact forces: leave it at its default"
         )
     model, data = robot.model, robot.model.createData()

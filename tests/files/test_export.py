@@ -326,6 +326,18 @@ def test_a_smoothed_motion_that_presses_on_is_told(arm: Solution, tmp_path: Path
         arm.export("csv", tmp_path / "late", smooth=(30.0, 500.0))
 
 
+@pytest.mark.slow
+def test_a_smoothed_motion_that_leaves_the_board_whole_is_refused(tmp_path: Path) -> None:
+    """Its impulse is larger than the plan's, as a board that does not break pushes back."""
+    chop = solve(load_problem("chop_arm"))
+    assert chop.collision.outcome["broken"]
+    with pytest.raises(InputError, match="does not break the board: it presses with"):
+        chop.export("csv", tmp_path / "whole", smooth=(20.0, 2000.0))
+    assert not (tmp_path / "whole").exists()
+    meta, _ = chop.export("csv", tmp_path / "broken", smooth=(60.0, 5000.0))
+    assert json.loads(meta.read_text())["expected"]["target"] == {"broken": 1.0}
+
+
 def test_feed_forward_beyond_the_torque_limit_is_told(planned: Planned, tmp_path: Path) -> None:
     """A smoothed motion that is near the plan's jumps accelerates beyond what its motors can."""
     path, out, robot = problem_file("arm_planar"), tmp_path / "csv", planned.problem.robot

@@ -283,7 +283,8 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
 
     Raises
     ------
-    InputError : no motion satisfies the limits; it does not hit the target, or presses more than it hits.
+    InputError : no motion satisfies the limits; it does not hit the target, or presses more than it hits; it
+        does not break a board that the plan breaks.
     """
     within = Smoothness(acceleration=limits[0], jerk=limits[1])
     reference = smoothed(planned.reference, planned.problem, within)
@@ -308,6 +309,13 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
             f"brakes too late: it gives the target {impulse:.3g} N s in the impact, and then presses on it "
             f"with {pressing:.3g} N s, until {touches[-1, 1] - touches[0, 0]:.2g} s after the first touch; "
             "give larger limits, or plan with a smaller fraction in [terms.velocity_limit]"
+        )
+    outcome = planned.record.summary.get("target") or {}
+    if outcome.get("broken") and not replayed.outcome["broken"]:
+        raise InputError(
+            f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "
+            f"does not break the board: it presses with {replayed.peak_force:.3g} N, the plan with "
+            f"{planned.record.summary['peak_force_N']:.3g} N; give larger limits"
         )
     driven = ~planned.problem.robot.passive
     ratio = np.abs(reference.torque[:, driven]) / planned.problem.robot.torque_limit[driven]

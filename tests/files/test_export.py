@@ -767,6 +767,26 @@ def test_the_command_writes_and_lists_files(
     assert done.exit_code == 2 and done.stderr.count("error:") == 1 and "'a'" in done.stderr
 
 
+def test_a_problem_file_that_is_not_the_plans_is_told(planned: Planned, tmp_path: Path) -> None:
+    """The target and the law in the files are then of another problem than the motion."""
+    path = problem_file("arm_planar")
+    text = path.read_text(encoding="utf-8")
+    own = {**planned.record.summary["problem"], "hash": load_problem(path).hash}
+    record = dataclasses.replace(
+        planned.record, problem=text, summary={**planned.record.summary, "problem": own}
+    )
+    save_record(record, tmp_path / "arm")
+    other = tmp_path / "other.toml"
+    other.write_text(text.replace("resistance_N = 600.0", "resistance_N = 500.0"), encoding="utf-8")
+    for file, told in ((path, False), (other, True)):
+        out = ["--to", "csv", "--out", str(tmp_path / "csv"), "--problem", str(file)]
+        done = runner.invoke(app, ["export", str(tmp_path / "arm"), *out])
+        assert done.exit_code == 0, done.output
+        assert ("is not the problem of this plan" in done.stdout) == told
+        done = runner.invoke(app, ["export", str(tmp_path / "arm"), *out, "--json"])
+        assert ("caution" in json.loads(done.stdout)) == told
+
+
 def test_the_command_knows_all_formats() -> None:
     assert list(get_args(Choice)) == list(FORMATS)
     assert callable(impactopt.export)

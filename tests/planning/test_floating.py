@@ -169,6 +169,8 @@ def test_an_exported_base_drifts_on_to_the_end(thrown: Solution, tmp_path: Path)
     frames = np.load(tmp_path / "mjlab" / "motion.npz")
     places, speeds = frames["body_pos_w"][-3:, 0], frames["body_lin_vel_w"][-3:, 0]
     np.testing.assert_allclose(np.diff(places, axis=0), 0.02 * (speeds[1:] + speeds[:-1]) / 2, atol=1e-5)
+    thrown.export("mujoco", tmp_path / "scene")
+    assert "m high" not in (tmp_path / "scene" / "play.py").read_text("utf-8")  # it does not stand
 
 
 def test_its_record_is_verified(thrown: Solution, tmp_path: Path) -> None:

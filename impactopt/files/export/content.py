@@ -163,8 +163,6 @@ class Export:
     def meta(self) -> dict[str, Any]:
         """Content of `meta.json`: everything but histories."""
         p, robot, s = self.problem, self.robot, self.planned.record.summary
-        striker = robot.striker(p.striker)
-        frame = robot.model.frames[robot.model.getFrameId(striker.model_frame)]
         return plain(
             {
                 "problem": p.name,
@@ -200,16 +198,21 @@ class Export:
                     **_numbers(p.target),
                 },
                 "contact_law": {"law": p.law.word or type(p.law).__name__, **_numbers(p.law)},
-                "striker": {
-                    "name": striker.name,
-                    "link": body_name(robot, int(frame.parentJoint)),
-                    "point_m": np.array(frame.placement.translation),
-                },
+                "striker": self._striker(p.striker),
+                "second": None
+                if p.second is None
+                else {"target_point_m": p.second.point, "striker": self._striker(p.second.striker)},
                 "expected": {name: s.get(name) for name in EXPECTED},
                 "support_polygon_m": self.planned.record.arrays["polygon"],
                 "versions": {**s.get("versions", {}), "export": __version__},
             }
         )
+
+    def _striker(self, name: str) -> dict[str, Any]:
+        robot = self.robot
+        frame = robot.model.frames[robot.model.getFrameId(robot.striker(name).model_frame)]
+        link, point = body_name(robot, int(frame.parentJoint)), np.array(frame.placement.translation)
+        return {"name": name, "link": link, "point_m": point}
 
     def _joints(self) -> list[dict[str, Any]]:
         robot, out = self.robot, []

@@ -80,12 +80,21 @@ def export(
             planned, to, directory, rate=rate, joints=names, gravity=gravity, smooth=limits
         )
         cost = None if limits is None else json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
+        own, caution = planned.record.summary.get("problem", {}).get("hash"), None
+        if problem is not None and own not in (None, planned.problem.hash):
+            caution = (
+                f"{problem} is not the problem of this plan: gains, limits, target and contact law in the "
+                "files are of it, the motion and what is expected are the plan's"
+            )
         if as_json:
             summary = {"to": to, "directory": str(directory), "files": [str(path) for path in written]}
+            summary |= {} if caution is None else {"caution": caution}
             print_json(summary | ({} if cost is None else {"smooth": cost}), True)
             return
         for path in written:
             typer.echo(printable(str(path)))
+        if caution is not None:
+            typer.echo(printable(f"caution: {caution}"))
         if cost is not None:
             meets = f"; it meets other bodies {cost['touches']} times" if cost["touches"] else ""
             if cost["pressing_ms"] >= 1:

@@ -88,12 +88,15 @@ def solution_of_record(record: Record, t: Transcription) -> Solution:
     numbers: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in given.items() if v is not None}
     status = Status(summary["status"])
     result = SolverResult(**numbers, status=status, message=str(summary["message"]))
+    outcome = Outcome.of(t, result)
+    estimated = outcome.usable and summary.get("collision_error_pct") is not None
     return solution_of(
-        Outcome.of(t, result),
+        outcome,
         solver=str(summary["solver"]),
         seconds=(float(summary["build_seconds"]), float(summary["solve_seconds"])),
         statement=str(record.arrays["program_statement"]),
         gains=tuple(map(ChosenGains.from_summary, summary.get("gains", ()))),
+        contact_error=outcome.at.contact_error if estimated else None,
     )
 
 

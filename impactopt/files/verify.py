@@ -7,7 +7,6 @@ independent statement of the program is in `tests/oracle/`.)
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -32,7 +31,6 @@ from impactopt.solvers.program import (
     constraint_violations,
     scaled_residual,
 )
-from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.transcription import Transcription, statement_of
 
 Array = NDArray[np.float64]
@@ -199,9 +197,7 @@ Deviation = tuple[str, float, str]  # name of what was checked, amount, place
 
 def _deviations(t: Transcription, record: Record) -> Iterator[Deviation]:
     """Deviations of arrays and summary from those computed from the variables, and those of the motion."""
-    solution = solution_of_record(record, t)
-    finer = contact_error(t, solution.result.x)
-    again = record_of(dataclasses.replace(solution, contact_error=finer))
+    again = record_of(solution_of_record(record, t))
     for name in sorted(again.arrays.keys() & record.arrays.keys()):
         if name.startswith(RECOMPUTED):
             yield "record", _difference(record.arrays[name], again.arrays[name]), name

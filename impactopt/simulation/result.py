@@ -136,6 +136,8 @@ class Simulation:
     force (k,) [N] : contact force of all strikers, at the instant
     target_speed, hand_speed (k,) : [m/s] along the normal
     target_travel (k,) [m] : displacement of the target along the normal from its place at the planned contact
+        In MuJoCo it agrees with the robot's place, which steps of first order leave behind: by 0.4 mm of 14
+        of a nail with 0.2 ms, in proportion to the step. The depth in `outcome` has no such error.
     target_aside (k, 3) [m] : displacement of the target across the normal; (0, 3): friction does not move it
     demand, torque (k, n) [N m] : of the servo before saturation, and of the motors
     gear (k, n) [N m] : torque of largest magnitude through each gear since the instant before

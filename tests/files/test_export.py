@@ -302,6 +302,13 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
 
 
 @pytest.mark.slow
+def test_a_smoothed_motion_keeps_velocity_limits_between_its_steps(arm: Solution, tmp_path: Path) -> None:
+    _, path = arm.export("csv", tmp_path / "csv", smooth=(40.0, 2000.0), rate=5000.0)
+    ratio = np.abs(from_csv(path, arm.problem.robot).v) / arm.problem.robot.velocity_limit
+    assert 0.99 < ratio.max() <= 1 + 1e-9  # it is at a limit
+
+
+@pytest.mark.slow
 def test_a_smoothed_motion_that_presses_on_is_told(arm: Solution, tmp_path: Path) -> None:
     """Low accelerations brake behind the target's surface: what the arm presses there is no impact."""
     meta, path = arm.export("csv", tmp_path / "csv", smooth=(15.0, 2000.0))
@@ -309,8 +316,26 @@ def test_a_smoothed_motion_that_presses_on_is_told(arm: Solution, tmp_path: Path
     whole = replayed(arm.problem, from_csv(path, arm.problem.robot)).impulse
     assert told["pressing_Ns"] > 0.1 * whole and told["pressing_ms"] > 50
     assert told["impulse_Ns"] + told["pressing_Ns"] == pytest.approx(whole, rel=2 * NEAR)
+    # what is expected is this motion's, not the plan's, whose impulse is larger
+    _, fine = arm.export("csv", tmp_path / "fine", smooth=(15.0, 2000.0), rate=20_000.0)
+    columns = read_csv(fine)
+    force = np.trapezoid(columns["force [N]"], columns["time [s]"])
+    expected = json.loads(meta.read_text())["expected"]
+    assert force == pytest.approx(whole, rel=2 * NEAR) == expected["impulse_Ns"] != arm.impulse
     with pytest.raises(InputError, match=r"brakes too late: .* then presses on it"):
         arm.export("csv", tmp_path / "late", smooth=(30.0, 500.0))
+
+
+@pytest.mark.slow
+def test_a_smoothed_motion_that_leaves_the_board_whole_is_refused(tmp_path: Path) -> None:
+    """Its impulse is larger than the plan's, as a board that does not break pushes back."""
+    chop = solve(load_problem("chop_arm"))
+    assert chop.collision.outcome["broken"]
+    with pytest.raises(InputError, match="does not break the board: it presses with"):
+        chop.export("csv", tmp_path / "whole", smooth=(20.0, 2000.0))
+    assert not (tmp_path / "whole").exists()
+    meta, _ = chop.export("csv", tmp_path / "broken", smooth=(60.0, 5000.0))
+    assert json.loads(meta.read_text())["expected"]["target"] == {"broken": 1.0}
 
 
 def test_feed_forward_beyond_the_torque_limit_is_told(planned: Planned, tmp_path: Path) -> None:
@@ -759,6 +784,26 @@ def test_the_command_writes_and_lists_files(
     assert json.loads(done.stdout)["directory"] == str(tmp_path / "arm_mjlab")
     done = runner.invoke(app, ["export", str(tmp_path / "arm"), "--to", "csv", "--joints", "a,b"])
     assert done.exit_code == 2 and done.stderr.count("error:") == 1 and "'a'" in done.stderr
+
+
+def test_a_problem_file_that_is_not_the_plans_is_told(planned: Planned, tmp_path: Path) -> None:
+    """The target and the law in the files are then of another problem than the motion."""
+    path = problem_file("arm_planar")
+    text = path.read_text(encoding="utf-8")
+    own = {**planned.record.summary["problem"], "hash": load_problem(path).hash}
+    record = dataclasses.replace(
+        planned.record, problem=text, summary={**planned.record.summary, "problem": own}
+    )
+    save_record(record, tmp_path / "arm")
+    other = tmp_path / "other.toml"
+    other.write_text(text.replace("resistance_N = 600.0", "resistance_N = 500.0"), encoding="utf-8")
+    for file, told in ((path, False), (other, True)):
+        out = ["--to", "csv", "--out", str(tmp_path / "csv"), "--problem", str(file)]
+        done = runner.invoke(app, ["export", str(tmp_path / "arm"), *out])
+        assert done.exit_code == 0, done.output
+        assert ("is not the problem of this plan" in done.stdout) == told
+        done = runner.invoke(app, ["export", str(tmp_path / "arm"), *out, "--json"])
+        assert ("caution" in json.loads(done.stdout)) == told
 
 
 def test_the_command_knows_all_formats() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,24 @@ def test_the_blow_takes_the_momentum_that_the_target_gets(thrown: Solution) -> N
     # the joints come to rest; the base drifts on
     assert np.abs(reference.v[-1, 6:]).max() < 1e-9
     assert np.linalg.norm(reference.v[-1, :6]) > 0.01
+
+
+def test_an_exported_base_drifts_on_to_the_end(thrown: Solution, tmp_path: Path) -> None:
+    """Velocities are those of the positions up to the last row, also of the row after the joints' rest."""
+    for to, rate in (("csv", 1000.0), ("mjlab", 50.0)):
+        thrown.export(to, tmp_path / to, rate=rate)
+    with open(tmp_path / "csv" / "motion.csv", newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    last = dict(zip(header, np.array(rows[-40:], dtype=float).T, strict=True))
+    places = np.column_stack([last[f"base position {axis} [m]"] for axis in "xyz"])
+    speeds = np.column_stack([last[f"base linear velocity {axis} [m/s]"] for axis in "xyz"])
+    steps = np.diff(last["time [s]"])[:, None]
+    np.testing.assert_allclose(np.diff(places, axis=0), steps * (speeds[1:] + speeds[:-1]) / 2, atol=1e-7)
+    frames = np.load(tmp_path / "mjlab" / "motion.npz")
+    places, speeds = frames["body_pos_w"][-3:, 0], frames["body_lin_vel_w"][-3:, 0]
+    np.testing.assert_allclose(np.diff(places, axis=0), 0.02 * (speeds[1:] + speeds[:-1]) / 2, atol=1e-5)
+    thrown.export("mujoco", tmp_path / "scene")
+    assert "m high" not in (tmp_path / "scene" / "play.py").read_text("utf-8")  # it does not stand
 
 
 def test_its_record_is_verified(thrown: Solution, tmp_path: Path) -> None:

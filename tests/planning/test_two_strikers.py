@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -288,3 +289,17 @@ def test_what_two_cannot_do_is_refused(problem: ImpactProblem) -> None:
     held: dict[str, Any] = {"hands": ("left_hand",)}
     with pytest.raises(InputError, match="holds on"):
         replace(problem, stance=replace(problem.stance, **held))
+
+
+@pytest.mark.slow
+def test_an_export_has_both_strikers_and_where_they_hit(
+    problem: ImpactProblem, solution: Solution, tmp_path: Path
+) -> None:
+    meta = json.loads(solution.export("csv", tmp_path / "csv")[0].read_text("utf-8"))
+    model, reference = problem.robot.model, solution.trajectory
+    data, at_contact = model.createData(), np.flatnonzero(reference.phase == 0)[-1]
+    pin.framesForwardKinematics(model, data, reference.q[at_contact])
+    hit = meta["target"]["point_m"], meta["second"]["target_point_m"]
+    for striker, point in zip((meta["striker"], meta["second"]["striker"]), hit, strict=True):
+        link = data.oMf[model.getFrameId(striker["link"])]
+        np.testing.assert_allclose(link.act(np.array(striker["point_m"])), point, atol=1e-4)

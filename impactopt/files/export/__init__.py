@@ -66,8 +66,9 @@ def export(
     Raises
     ------
     InputError : an unknown format, a plan that is not solved, joints that are no permutation of the robot's,
-        a directory with other files, a missing package; no gravity for a robot on soles, or a format that
-        needs it; smoothing of a robot on soles, or limits that no motion satisfies. Nothing is written then.
+        a directory with other files, a missing package; a robot that is not bolted, without gravity or
+        smoothed; a format that needs gravity, without; limits that no motion satisfies. Nothing is written
+        then.
     """
     check_choice("there is no format", to, FORMATS)
     default = FORMATS[to].rate

@@ -30,7 +30,7 @@ from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation import simulate
-from impactopt.simulation.result import MAX_GAP, parts_from
+from impactopt.simulation.result import MAX_GAP, Simulation, parts_from
 from impactopt.solvers.program import Status
 from impactopt.transcription.plan import Trajectory
 
@@ -109,6 +109,7 @@ def _check_replaceable(directory: Path, to: str) -> None:
 Array = NDArray[np.float64]
 MIN_RATE, MAX_RATE = 1.0, 1e5  # [Hz]
 PHASES = ("swing", "contact", "follow-through")
+EXPECTED = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -162,9 +163,6 @@ class Export:
     def meta(self) -> dict[str, Any]:
         """Content of `meta.json`: everything but histories."""
         p, robot, s = self.problem, self.robot, self.planned.record.summary
-        striker = robot.striker(p.striker)
-        frame = robot.model.frames[robot.model.getFrameId(striker.model_frame)]
-        expected = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
         return plain(
             {
                 "problem": p.name,
@@ -200,16 +198,21 @@ class Export:
                     **_numbers(p.target),
                 },
                 "contact_law": {"law": p.law.word or type(p.law).__name__, **_numbers(p.law)},
-                "striker": {
-                    "name": striker.name,
-                    "link": body_name(robot, int(frame.parentJoint)),
-                    "point_m": np.array(frame.placement.translation),
-                },
-                "expected": {name: s.get(name) for name in expected},
+                "striker": self._striker(p.striker),
+                "second": None
+                if p.second is None
+                else {"target_point_m": p.second.point, "striker": self._striker(p.second.striker)},
+                "expected": {name: s.get(name) for name in EXPECTED},
                 "support_polygon_m": self.planned.record.arrays["polygon"],
                 "versions": {**s.get("versions", {}), "export": __version__},
             }
         )
+
+    def _striker(self, name: str) -> dict[str, Any]:
+        robot = self.robot
+        frame = robot.model.frames[robot.model.getFrameId(robot.striker(name).model_frame)]
+        link, point = body_name(robot, int(frame.parentJoint)), np.array(frame.placement.translation)
+        return {"name": name, "link": link, "point_m": point}
 
     def _joints(self) -> list[dict[str, Any]]:
         robot, out = self.robot, []
@@ -245,17 +248,22 @@ def export_of(
     Raises
     ------
     InputError : the plan is not solved; joints that are no permutation of the robot's; a rate out of range;
-        a robot on soles without gravity, or smoothed; limits that no motion satisfies, or none that hits.
+        a robot that is not bolted, without gravity or smoothed; limits that no motion satisfies, or none that
+        hits.
     """
     robot = planned.problem.robot
     order = check_export(planned.record.summary.get("status"), robot, rate, joints)
     smoothing: dict[str, float] | None = None
     if smooth is not None:
-        planned, smoothing = _smoothed(planned, smooth)
+        planned, smoothing, replayed = _smoothed(planned, smooth)
     reference, missed = planned.reference, planned.missed
     if not gravity:
         reference = _without_gravity(reference, robot)
         missed = None if missed is None else _without_gravity(missed, robot)
+    motion = motion_at(reference, robot, rate, order, planned.record.arrays, jumps=smooth is None)
+    if smooth is not None:
+        force = np.interp(motion.time, replayed.contact_time, replayed.contact_force)
+        motion = dataclasses.replace(motion, force=force)
     return Export(
         planned=planned,
         joints=tuple(robot.joint_names[k] for k in order),
@@ -263,14 +271,14 @@ def export_of(
         rate=rate,
         gravity=gravity,
         smooth=smoothing,
-        motion=motion_at(reference, robot, rate, order, planned.record.arrays, jumps=smooth is None),
+        motion=motion,
         missed=None if missed is None else motion_at(missed, robot, rate, order, {}),
     )
 
 
-def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, dict[str, float]]:
+def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, dict[str, float], Simulation]:
     """The plan with a smoothed reference and without its abort motion, which would begin with a jump; limits
-    and impulses of the smoothed motion in a replay.
+    and impulses of the smoothed motion in a replay; the replay, whose contact the plan's summary has.
 
     A motion that cannot brake at contact has its reference behind the target, and presses on it after the
     impact. That impulse is `pressing_Ns`; `pressing_ms` is the time from the impact to the last contact.
@@ -278,7 +286,8 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
 
     Raises
     ------
-    InputError : no motion satisfies the limits; it does not hit the target, or presses more than it hits.
+    InputError : no motion satisfies the limits; it does not hit the target, or presses more than it hits; it
+        does not break a board that the plan breaks.
     """
     within = Smoothness(acceleration=limits[0], jerk=limits[1])
     reference = smoothed(planned.reference, planned.problem, within)
@@ -304,6 +313,13 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
             f"with {pressing:.3g} N s, until {touches[-1, 1] - touches[0, 0]:.2g} s after the first touch; "
             "give larger limits, or plan with a smaller fraction in [terms.velocity_limit]"
         )
+    outcome = planned.record.summary.get("target") or {}
+    if outcome.get("broken") and not replayed.outcome["broken"]:
+        raise InputError(
+            f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "
+            f"does not break the board: it presses with {replayed.peak_force:.3g} N, the plan with "
+            f"{planned.record.summary['peak_force_N']:.3g} N; give larger limits"
+        )
     driven = ~planned.problem.robot.passive
     ratio = np.abs(reference.torque[:, driven]) / planned.problem.robot.torque_limit[driven]
     smoothing = {
@@ -316,15 +332,21 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
         "touches": len(replayed.touched),
         "feed_forward_ratio": float(ratio.max()),
     }
-    return dataclasses.replace(planned, reference=reference, missed=None), smoothing
+    record, limit = planned.record, planned.problem.robot.torque_limit
+    report = replayed.report(
+        torque_limit=limit, polygon=record.arrays["polygon"], planned_impulse=smoothing["planned_impulse_Ns"]
+    )
+    summary = {**record.summary, **{name: report[name] for name in EXPECTED}}
+    record = dataclasses.replace(record, summary=summary)
+    return dataclasses.replace(planned, record=record, reference=reference, missed=None), smoothing, replayed
 
 
 def _without_gravity(reference: Trajectory, robot: Robot) -> Trajectory:
     """The reference with feed-forward less g(q), for joints with a motor."""
     if robot.floating:
         raise InputError(
-            "gravity: the torques of a robot on soles depend on the contact forces, so gravity's part of "
-            "them is not defined; leave it at its default"
+            "gravity: only torques of a bolted robot have a part for gravity alone, those of one on soles "
+            "depend on the contact forces: leave it at its default"
         )
     model, data = robot.model, robot.model.createData()
     weight = np.array([pin.computeGeneralizedGravity(model, data, q) for q in reference.q])

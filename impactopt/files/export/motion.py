@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.interpolate import BPoly, PchipInterpolator
 from scipy.spatial.transform import Rotation
@@ -82,7 +83,7 @@ def motion_at(
     jumps : add both sides of the reference's jumps to the samples, `JUMP` apart; else there are samples at
         multiples of 1 / rate only.
     """
-    reference = _with_rest_at_end(reference, 1 / rate)
+    reference = _with_rest_at_end(reference, robot, 1 / rate)
     # multiples of 1 / rate, to the first one at or after the end, where the robot is at rest
     grid = np.arange(int(np.ceil(reference.end * rate - 1e-9)) + 1) / rate
     grid = grid if not jumps else np.append(grid[grid < reference.end - JUMP], reference.end)
@@ -147,11 +148,11 @@ def with_passive_at_rest(motion: Motion, passive: NDArray[np.bool_]) -> Motion:
     return dataclasses.replace(motion, **fixed)
 
 
-def _with_rest_at_end(reference: Trajectory, period: float) -> Trajectory:
+def _with_rest_at_end(reference: Trajectory, robot: Robot, period: float) -> Trajectory:
     """The reference with its last instant, at rest, at `end` exactly, and once more after a `period` [s].
 
     So the curve ends there. Through instants before and after `end` it would not be at rest. The first
-    multiple of the period after `end` is in it.
+    multiple of the period after `end` is in it. The base of a robot without soles drifts on meanwhile.
     """
     fields = {f.name: getattr(reference, f.name) for f in dataclasses.fields(reference)}
     histories = {name: value for name, value in fields.items() if np.ndim(value)}
@@ -159,6 +160,13 @@ def _with_rest_at_end(reference: Trajectory, period: float) -> Trajectory:
     if before < len(reference.time):
         histories = {name: np.concatenate([x[:before], x[-1:], x[-1:]]) for name, x in histories.items()}
         histories["time"][-2:] = reference.end, max(reference.time[-1], reference.end + period + JUMP)
+        if robot.floating and not np.any(reference.ground):
+            for k in (-2, -1):
+                here = int(np.searchsorted(reference.time, histories["time"][k], side="right")) - 1
+                q, v, a = reference.q[here], reference.v[here], reference.a[here]
+                dt = histories["time"][k] - reference.time[here]
+                histories["q"][k, :7] = pin.integrate(robot.model, q, dt * (v + dt / 2 * a))[:7]
+                histories["v"][k, :6], histories["a"][k, :6] = (v + dt * a)[:6], a[:6]
     return dataclasses.replace(reference, **histories)
 
 

@@ -343,5 +343,5 @@ def _player(problem: ImpactProblem) -> str:
         numbers=f"{', '.join(numbers)} = {', '.join(repr(float(x)) for x in numbers.values())}",
         before=before,
         law=LAWS[type(problem.law)],
-        after=BASE if problem.robot.floating else "",
+        after=BASE if problem.soles else "",
     )

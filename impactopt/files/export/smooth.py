@@ -49,12 +49,14 @@ def smoothed(reference: Trajectory, problem: ImpactProblem, limits: Smoothness) 
 
     Raises
     ------
-    InputError : the robot stands on soles, which joints smoothed one by one would move; no motion within the
-        limits ends at rest where the plan does.
+    InputError : the robot's base is not bolted, which joints smoothed one by one would move; no motion within
+        the limits ends at rest where the plan does.
     """
     robot, c = problem.robot, problem.coordinates
     if robot.floating:
-        raise InputError("smooth: joints of legs cannot be smoothed one by one; it is for bolted robots")
+        raise InputError(
+            "smooth: it is for bolted robots; smoothing the joints one by one would move the base of others"
+        )
     position = np.unwrap([c.split(q)[0] for q in reference.q], axis=0)
     end = reference.end + EXTRA_TIME
     step = max(MIN_STEP, end / MAX_STEPS)
@@ -119,16 +121,20 @@ def _joint(
             [None, None, increment, -h * here, None, None],
         ]
     )
-    # inequalities: |position - reference| <= bound, and the same of velocity
-    deviations = sp.bmat(
+    # Inequalities: |position - reference| <= bound, and the same of velocity; the velocity's middle Bernstein
+    # coefficient within its limit, so that a step's velocity is between its ends too.
+    inequalities = sp.bmat(
         [
             [one, None, None, None, -one, None],
             [-one, None, 0 * one, 0 * one, -one, None],
             [None, one, None, None, None, -one],
             [None, -one, None, None, None, -one],
+            [None, one, h / 2 * one, None, None, None],
+            [None, -one, -h / 2 * one, None, None, None],
         ]
     )
     lowest, highest, fastest = own
+    largest = np.concatenate([position, -position, velocity, -velocity, np.full(2 * k, fastest)])
     # at both ends the joint is at rest, at the reference's position
     ends = np.zeros(k, dtype=bool)
     ends[[0, -1]] = True
@@ -139,12 +145,12 @@ def _joint(
     # programs in any units.
     sizes = np.array([POSITION_TIME, 1.0, limits.acceleration, limits.jerk])
     column = np.repeat([*sizes, *sizes[:2]], k)
-    equation, inequality = np.repeat(sizes[:3], k - 1), np.repeat(sizes[:2], 2 * k)
+    equation, inequality = np.repeat(sizes[:3], k - 1), np.repeat(sizes[[0, 1, 1]], 2 * k)
     bounds = np.stack([[*lower, *np.zeros((2, k))], [*upper, *np.full((2, k), np.inf)]])
     found = linprog(
         np.concatenate([np.zeros(4 * k), weight, weight]),
-        A_ub=sp.diags(1 / inequality) @ deviations @ sp.diags(column),
-        b_ub=np.concatenate([position, -position, velocity, -velocity]) / inequality,
+        A_ub=sp.diags(1 / inequality) @ inequalities @ sp.diags(column),
+        b_ub=largest / inequality,
         A_eq=sp.diags(1 / equation) @ integration @ sp.diags(column),
         b_eq=np.zeros(3 * (k - 1)),
         bounds=(bounds.reshape(2, -1) / column).T,

@@ -36,6 +36,7 @@ def check(
             sticks_out,
             too_weak,
             unusual,
+            without_effect,
         )
         from impactopt.problem.plausibility import doubts
 
@@ -49,6 +50,7 @@ def check(
                 too_weak(problem),
                 overlapping(problem),
                 *unusual(problem),
+                *without_effect(problem),
                 *sticks_out(problem),
                 *doubts(problem.robot),
             )

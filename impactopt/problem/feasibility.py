@@ -19,7 +19,14 @@ from impactopt.kinematics.operational_space import striking_point
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.plausibility import giant_soles
 from impactopt.problem.strength import random_postures
-from impactopt.problem.terms import TorqueLimit
+from impactopt.problem.terms import (
+    DEFAULT_TERMS,
+    Balance,
+    ContactWrenchCone,
+    GroundForce,
+    LegExtension,
+    TorqueLimit,
+)
 from impactopt.problem.terms.first_touch import face_of
 
 if TYPE_CHECKING:
@@ -141,6 +148,18 @@ def unusual(problem: ImpactProblem) -> list[str]:
     if isinstance(problem.target, Nail) and problem.target.resistance < SOFT_WOOD:
         found.append(f"[target] resistance_N: {problem.target.resistance:g} N is no wood's; is it in kN?")
     return found
+
+
+def without_effect(problem: ImpactProblem) -> list[str]:
+    """Messages about terms that bound nothing, as the robot stands on no soles."""
+    kinds = (Balance, ContactWrenchCone, GroundForce, LegExtension)
+    given = [term for term in problem.terms if isinstance(term, kinds) and term not in DEFAULT_TERMS]
+    return [
+        f"[terms.{term.name.replace(' ', '_')}] has no effect: it is of soles on the ground, and the robot "
+        "has none"
+        for term in given
+        if not problem.soles and getattr(term, "enabled", True)
+    ]
 
 
 def _out_of_balance(problem: ImpactProblem) -> str:

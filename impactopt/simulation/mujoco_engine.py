@@ -235,7 +235,7 @@ class _Replay(MujocoRobot):
     def apply_perturbation(self, t: float) -> None:
         """Applies the perturbation's push on the base at a time [s]."""
         world = self.perturbation
-        if not (self.floating and world.push):
+        if not world.push:
             return
         on = world.push_start <= t < world.push_start + world.push_time
         direction = np.array([np.cos(world.push_way), np.sin(world.push_way)])
@@ -395,6 +395,10 @@ def simulate_mujoco(
             "hands: take the servo"
         )
     world = perturbation if perturbation is not None else Perturbation()
+    if world.push and not robot.floating:
+        raise InputError(
+            f"perturbation: push acts on the base, and that of {robot.name!r} is bolted: leave it out"
+        )
     beyond = settle if settle is not None else SETTLE if scene.soles else SETTLE_WITHOUT_SOLES
     solver = MujocoOptions(step, iterations, tolerance)
     replay = _Replay(robot, reference, scene, world, solver, controller, contact)

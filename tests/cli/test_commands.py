@@ -84,6 +84,15 @@ def test_check_lists_every_mistake(file: Path) -> None:
     assert "is not TOML" in mistake
 
 
+@pytest.mark.slow
+def test_check_doubts_terms_that_bound_nothing(file: Path) -> None:
+    given = ("terms.balance.angular_momentum=3", "terms.contact_wrench_cone.margin=0.01")
+    arguments = [word for setting in given for word in ("--set", setting)]
+    doubts = " ".join(json.loads(run("check", file, "--json", *arguments)[0])["doubts"])
+    for name in ("balance", "contact_wrench_cone"):
+        assert f"[terms.{name}] has no effect: it is of soles on the ground" in doubts
+
+
 def test_verbose_shows_where_an_error_is_from(file: Path) -> None:
     arguments = ("check", file, "--set", "target.mass=-1")
     assert "Traceback" not in run(*arguments, code=2)[1]

@@ -521,6 +521,13 @@ def test_every_condition_has_its_range_and_the_defaults_are_the_plan() -> None:
 # ---- what cannot be replayed
 
 
+def test_a_bolted_robot_cannot_be_pushed() -> None:
+    """The push acted on nothing, without a word."""
+    still = reference([0.0, 1.0], np.zeros(1), nv=1, n=1)
+    with pytest.raises(InputError, match=r"push acts on the base, .* is bolted: leave it out"):
+        simulate_mujoco(slider(6.0), still, scene(), perturbation=Perturbation(push=10.0))
+
+
 def test_without_mujoco_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     still = reference([0.0, 1.0], np.zeros(1), nv=1, n=1)

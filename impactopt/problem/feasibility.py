@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from impactopt.bodies.clearance import Places, Touch
+from impactopt.contact.fields import snake_case
 from impactopt.contact.targets import Nail
 from impactopt.errors import InputError, counted
 from impactopt.kinematics.inverse_kinematics import Reach, inverse_kinematics, reach
@@ -155,7 +156,7 @@ def without_effect(problem: ImpactProblem) -> list[str]:
     kinds = (Balance, ContactWrenchCone, GroundForce, LegExtension)
     given = [term for term in problem.terms if isinstance(term, kinds) and term not in DEFAULT_TERMS]
     return [
-        f"[terms.{term.name.replace(' ', '_')}] has no effect: it is of soles on the ground, and the robot "
+        f"[terms.{snake_case(type(term).__name__)}] has no effect: it is of soles on the ground, and the robot "
         "has none"
         for term in given
         if not problem.soles and getattr(term, "enabled", True)

@@ -156,8 +156,8 @@ def without_effect(problem: ImpactProblem) -> list[str]:
     kinds = (Balance, ContactWrenchCone, GroundForce, LegExtension)
     given = [term for term in problem.terms if isinstance(term, kinds) and term not in DEFAULT_TERMS]
     return [
-        f"[terms.{snake_case(type(term).__name__)}] has no effect: it is of soles on the ground, and the robot "
-        "has none"
+        f"[terms.{snake_case(type(term).__name__)}] has no effect: it is of soles on the ground, and the "
+        "robot has none"
         for term in given
         if not problem.soles and getattr(term, "enabled", True)
     ]

@@ -181,6 +181,16 @@ def arm_model(name: str, links: tuple[Link, ...], base: Box | None = None) -> An
     return model
 
 
+def with_overrides(options: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """A preset's options with a user's; a table by joint or posture adds to that of the preset."""
+    tables = {
+        name: {**options[name], **given}
+        for name, given in overrides.items()
+        if isinstance(given, Mapping) and isinstance(options.get(name), Mapping)
+    }
+    return {**options, **overrides, **tables}
+
+
 def _arm(
     whole: Any, links: tuple[Link, ...], ready: Mapping[str, float], locked: Locked, options: dict[str, Any]
 ) -> Robot:
@@ -192,7 +202,7 @@ def _arm(
         "kd": {part.joint: 0.1 * part.drive.torque for part in links if part.joint in joints},
         "postures": {"ready": {joint: angle for joint, angle in ready.items() if joint in joints}},
     }
-    return Robot.from_model(model, **{**own, **options})
+    return Robot.from_model(model, **with_overrides(own, options))
 
 
 def planar_arm(*, locked: Locked = (), **overrides: Any) -> Robot:

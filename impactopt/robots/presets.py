@@ -21,7 +21,15 @@ from impactopt.robots import link_tables
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source
 from impactopt.robots.build import joint_names, lock_joints, locked_angles
-from impactopt.robots.link_tables import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, TOE, Locked, standin_model
+from impactopt.robots.link_tables import (
+    GRIPPER_LENGTH,
+    SOLE_CORNERS,
+    SOLE_HEIGHT,
+    TOE,
+    Locked,
+    standin_model,
+    with_overrides,
+)
 from impactopt.robots.robot import Robot, Sole, Striker
 
 P = ParamSpec("P")
@@ -72,7 +80,7 @@ def talos(*, locked: Locked = (), **overrides: Any) -> Robot:
         ),
         "postures": {"half_sitting": {"leg_left_6_joint": 0.0, "leg_right_6_joint": 0.0}},
     }
-    return Robot.from_urdf(folder / "robots" / "talos_reduced.urdf", **{**options, **overrides})
+    return Robot.from_urdf(folder / "robots" / "talos_reduced.urdf", **with_overrides(options, overrides))
 
 
 # Reflected rotor inertia [kg m2] of G1's actuators, from the rotor and gear data that public simulation
@@ -185,9 +193,8 @@ def g1(*, locked: Locked = (), **overrides: Any) -> Robot:
         ),
         "postures": {"half_sitting": {joint: x for joint, x in posture.items() if joint in drives}},
     }
-    return Robot.from_urdf(
-        example_robots() / "g1_description" / "urdf" / "g1_29dof_rev_1_0.urdf", **{**options, **overrides}
-    )
+    urdf = example_robots() / "g1_description" / "urdf" / "g1_29dof_rev_1_0.urdf"
+    return Robot.from_urdf(urdf, **with_overrides(options, overrides))
 
 
 _HALF_SITTING = {  # of the left side; the right one is its mirror image
@@ -271,7 +278,7 @@ def standin(*, floating: bool = True, locked: Locked = (), **overrides: Any) -> 
             for name, angles in (("half_sitting", posture), ("on_left_foot", {**posture, **_ON_LEFT_FOOT}))
         },
     }
-    return Robot.from_model(model, **{**options, **overrides})
+    return Robot.from_model(model, **with_overrides(options, overrides))
 
 
 _PRESETS: dict[str, Callable[..., Robot]] = {

@@ -144,6 +144,20 @@ def test_preset_takes_overrides() -> None:
     assert robot.torque_limit[robot.joint_index("arm_right_4_joint")] == 5
 
 
+@pytest.mark.parametrize("preset", ["talos", "g1", "standin", "planar_arm", "arm7", "space_arm"])
+def test_a_table_by_joint_changes_these_joints_of_a_preset_alone(preset: str) -> None:
+    """G1's other joints lost their armature by one of an elbow, and others got gains of 150."""
+    whole = load_robot(preset)
+    other = whole.joint_names[1]
+    for name in ("armature", "kd", "kp", "torque_limit", "velocity_limit"):
+        found, before = getattr(load_robot(preset, **{name: {other: 1.5}}), name), getattr(whole, name)
+        assert np.flatnonzero(found != before).tolist() == [1] and found[1] == 1.5, name
+    added = load_robot(preset, postures={"mine": {other: 0.1}})
+    assert {*added.postures} == {*whole.postures, "mine"}
+    for name, q in whole.postures.items():
+        np.testing.assert_array_equal(added.postures[name], q)
+
+
 @pytest.mark.parametrize(
     ("preset", "joint"),
     [

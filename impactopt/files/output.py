@@ -285,12 +285,14 @@ def remove_file(path: Path) -> None:
 
 
 def check_ending(what: str, path: Path, *endings: str) -> None:
-    """InputError unless the name of a file ends with one of the endings.
+    """InputError unless the name of a file ends with one of the endings, and no folder has it.
 
     what : start of the message, such as "a page is HTML".
     """
     if path.suffix.lower() not in endings:
         raise InputError(f"{what}: give {path.name or str(path)!r} the ending {endings[0]}")
+    if path.is_dir():
+        raise InputError(f"{what}: {str(path)!r} is a folder; give a file in it, or another name")
 
 
 def write_file(

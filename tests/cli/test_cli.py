@@ -538,3 +538,6 @@ def test_places_that_cannot_be_written_are_refused_before_the_work(
     assert "give 'sheet.svg' the ending .png" in error
     _, error = run("validate", tmp_path / "out", "--animation", "motion.mp4", code=2)
     assert "give 'motion.mp4' the ending .gif" in error
+    (tmp_path / "motion.gif").mkdir()
+    _, error = run("validate", tmp_path / "out", "--animation", tmp_path / "motion.gif", code=2)
+    assert "motion.gif' is a folder" in error

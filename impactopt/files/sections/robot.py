@@ -143,10 +143,10 @@ class GainSection(Section):
 class RobotSection(Section):
     """A preset with changes, or a URDF or MJCF; files are relative to the problem file.
 
-    A preset keeps its own strikers beside the section's.
+    A preset keeps its own strikers and postures, and the numbers of other joints, beside the section's.
     """
 
-    preset: Preset = optional("see `impactopt robots`")
+    preset: Preset = optional("see `impactopt robots`; tables by joint or name add to its own")
     urdf: str = optional("the robot's URDF, in place of a preset")
     mjcf: str = optional("the robot's MJCF, in place of a preset")
     srdf: str = optional("named postures and rotors of the URDF")

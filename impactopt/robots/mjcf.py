@@ -437,8 +437,8 @@ class _Reader(Compiled):
         return free or self._six(b)
 
     def _six(self, b: int) -> bool:
-        """True if three slides and three hinges move a body on the ground, without limits, motors, tendons and
-        equalities.
+        """True if three slides and three hinges move a body on the ground, without limits, motors, tendons
+        or equalities.
         """
         mj, first, kinds = self.mj, int(self.mj.body_jntadr[b]), self.mujoco.mjtJoint
         joints = np.s_[first : first + 6]

@@ -252,7 +252,9 @@ SIX = "".join(
 def test_six_joints_that_move_a_root_like_a_free_one_are_one(tree: Path, tmp_path: Path) -> None:
     """As in models that stem from OpenSim; a thing beside the robot on six such joints is no robot."""
     sprung = SIX.replace('name="base_hinge2"', 'name="base_hinge2" stiffness="5"')
-    text = TREE.replace('<freejoint name="root"/>', sprung).replace("<freejoint/>", SIX.replace("base", "ball"))
+    text = TREE.replace('<freejoint name="root"/>', sprung).replace(
+        "<freejoint/>", SIX.replace("base", "ball")
+    )
     home = ".1 .2 .3 .4 .5 .6 .3 .2 0.1 2 2 0 1 1 0 0"
     text = re.sub(
         r"<keyframe>.*</keyframe>", f'<keyframe><key name="home" qpos="{home}"/></keyframe>', text, flags=re.S

@@ -12,7 +12,17 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
-from impactopt import Ground, ImpactProblem, KeepOut, Obstacle, Solution, Status, load_problem, solve
+from impactopt import (
+    Ground,
+    ImpactProblem,
+    KeepOut,
+    Obstacle,
+    SelfCollision,
+    Solution,
+    Status,
+    load_problem,
+    solve,
+)
 from impactopt.bodies.clearance import Places
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
@@ -193,3 +203,13 @@ def test_a_plan_that_loses_most_of_a_clearance_is_not_called_solved() -> None:
     assert found.clearance()["clearance_mm"] < 25
     assert found.status is not Status.SOLVED
     assert re.search(r"wrist and ground .* instead of 50 \(\[terms.keep_out\] margin_m", found.result.message)
+
+
+def test_a_lost_clearance_of_two_links_names_its_section(free: Solution) -> None:
+    problem = dataclasses.replace(free.problem, terms=(*free.problem.terms, SelfCollision(margin=2.0)))
+    budget, margins = Budget(solver="ipm", options=None, time_limit=None, callback=None), Margins(problem)
+    budget.stop.asked = True  # so nothing is added
+    # as far as in a start posture that is stretched out
+    margins._required = {pair: 2.0 for pair in map(tuple, margins.bodies.shapes.pairs) if pair[1] >= 0}
+    found = BetweenNodes(budget, margins).refined(Outcome.of(program_of(free, problem), free.result)).result
+    assert found.status is Status.ACCEPTABLE and "[terms.self_collision] margin_m" in found.message

@@ -95,6 +95,18 @@ def test_starts_with_other_links_on_the_ground_have_other_bodies() -> None:
     assert same_bodies(one, dataclasses.replace(one, point=one.point + np.array([0.0, 0.0, 0.01])))
 
 
+def test_stances_with_other_intervals_have_constraints_at_other_nodes() -> None:
+    """A warm start with the constraints of a step's other grading ended in a KeyError."""
+    problem = load_problem("punch_step")
+    first, *rest = problem.stances
+    assert first.phase is not None
+    graded = dataclasses.replace(first, phase=dataclasses.replace(first.phase, grading=2.0))
+    assert not same_bodies(problem, dataclasses.replace(problem, stances=(graded, *rest)))
+    assert same_bodies(
+        problem, dataclasses.replace(problem, point=problem.point + np.array([0.0, 0.0, 0.01]))
+    )
+
+
 def test_bodies_that_are_near_at_the_start_may_not_penetrate_more_than_their_rounded_shapes() -> None:
     """Rounded shapes of bodies 1 mm apart penetrate; these were allowed to, by 2 mm, and so were refused."""
     problem = load_problem("arm_planar")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
 from impactopt import (
+    GainFactor,
     Ground,
     ImpactProblem,
     KeepOut,
@@ -207,11 +208,12 @@ def test_a_limit_of_iterations_that_nobody_has_set_is_no_answer(free: Solution) 
 
 
 @pytest.mark.slow
-def test_a_plan_that_loses_most_of_a_clearance_is_not_called_solved() -> None:
+@pytest.mark.parametrize("gains", [(), (GainFactor(joints=["elbow"], factor=(0.5, 2.0)),)])
+def test_a_plan_that_loses_most_of_a_clearance_is_not_called_solved(gains: tuple[GainFactor, ...]) -> None:
     """The hammer's face goes to 9 mm above this floor, and may not: it drives the nail 6 mm into it."""
     problem = load_problem("arm_planar")
     terms = (*problem.terms, KeepOut(margin=0.05))
-    found = solve(dataclasses.replace(problem, ground=Ground(height=0.735), terms=terms))
+    found = solve(dataclasses.replace(problem, ground=Ground(height=0.735), terms=terms, gains=gains))
     assert found.clearance()["clearance_mm"] < 25
     assert found.status is not Status.SOLVED
     assert re.search(r"wrist and ground .* instead of 50 \(\[terms.keep_out\] margin_m", found.result.message)

@@ -162,7 +162,7 @@ def check_hands(problem: Any) -> None:
 def check_motors(problem: Any) -> None:
     """InputError for a bound on motors none of which has the data, so that a plan would ignore it."""
     robot = problem.robot
-    for kind, name, other in ((MotorCurve, "stall_torque", ""), (PowerLimit, "power_limit", "its limit, or ")):
+    for kind, name, other in ((MotorCurve, "stall_torque", ""), (PowerLimit, "power_limit", "a limit, or ")):
         term = problem.extra(kind)
         limited = term is None or getattr(term, "limit", None) is not None
         if not limited and np.isnan(numbers_of(robot.actuators, name)).all():

@@ -199,7 +199,7 @@ def test_friction_that_takes_all_of_a_motor_is_refused(arm_transcription: Transc
         changed(arm_transcription, terms=(MotorCurve(fraction=0.5),), robot=robot)
 
 
-@pytest.mark.parametrize(("term", "other"), [(MotorCurve(), ""), (PowerLimit(), "its limit, or ")])
+@pytest.mark.parametrize(("term", "other"), [(MotorCurve(), ""), (PowerLimit(), "a limit, or ")])
 def test_a_bound_on_motors_without_data_is_refused(term: MotorCurve | PowerLimit, other: str) -> None:
     problem = load_problem("arm_planar")
     data: dict[str, Any] = {"stall_torque": 200.0, "no_load_speed": 10.0, "power_limit": 100.0}

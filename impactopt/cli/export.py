@@ -82,9 +82,10 @@ def export(
         cost = None if limits is None else json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
         own, caution = planned.record.summary.get("problem", {}).get("hash"), None
         if problem is not None and own not in (None, planned.problem.hash):
+            plans = "motion and what is expected are" if limits is None else "motion is"
             caution = (
                 f"{problem} is not the problem of this plan: gains, limits, target and contact law in the "
-                "files are of it, the motion and what is expected are the plan's"
+                f"files are of it, the {plans} the plan's"
             )
         if as_json:
             summary = {"to": to, "directory": str(directory), "files": [str(path) for path in written]}

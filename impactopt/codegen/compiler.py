@@ -197,7 +197,7 @@ class SharedCode:
     Attributes
     ----------
     name : for the file's name.
-    code : C, one translation unit, whose functions are hidden outside of a library.
+    code : C, one translation unit, whose functions are hidden outside of a library; their linkage is SHARED.
     level : of optimization, as the compiler's flags.
     """
 
@@ -224,6 +224,11 @@ class NativeCode:
     graph: Callable[[], ca.Function]
     level: str = field(default_factory=_level)
     shared: SharedCode | None = None
+
+    @property
+    def whole(self) -> str:
+        """Code with what it shares as static functions, for a library that has several such codes."""
+        return self.code if self.shared is None else f"#define SHARED static\n{self.shared.code}\n{self.code}"
 
 
 Buildable = Any  # ca.Function or NativeCode

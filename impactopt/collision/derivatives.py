@@ -339,11 +339,11 @@ def export(
     if compiler is None:
         raise InputError(f"export: it needs a C compiler that works; {why_no_compiler()}")
     native = native_collision(model, tuple(whole.name_out()), every=every)
-    codes = {native.name: native.code}
+    codes = {native.name: native.whole}
 
     def derivatives(part: Part) -> tuple[Any, Mapping[str, Any]]:
         what, build = native_part(model, part, every)
-        codes[part.name] = build().code
+        codes[part.name] = build().whole
         function = compiled(part.name, what, build)
         return function, dict.fromkeys(function.name_in(), 1.0)
 

@@ -210,8 +210,8 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """The problem as the record's plan has it: with its lazy constraints, order of touches, optimized gains
-    and prices of the style.
+    """The problem as the record's plan has it: with its collision model, lazy constraints, order of touches,
+    optimized gains and prices of the style.
 
     given : the file is one given by the user, not the record's own text.
     """
@@ -221,6 +221,8 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
         problem = with_chosen(problem, [each["factor"] for each in gains])
         if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
             problem = replace(problem, price_scale=scale)
+        if problem.collision == "auto":
+            problem = replace(problem, collision=record.summary.get("collision_model", "full"))
         if touches := record.summary.get("touches"):
             problem = replace(problem, touches=tuple(touches) if isinstance(touches, list) else touches)
         return with_lazy_constraints(problem, record.summary.get("rows_on_demand", ()))

@@ -17,6 +17,7 @@ from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.planning.solution import Solution
 from impactopt.report.stage import middle
 from impactopt.report.tracks import Track
+from impactopt.solvers.program import Status
 
 FRAME = 1 / 30  # [s] between frames
 SPEEDS = {"1": 1.0, "1/4": 0.25, "1/20": 0.05}  # of the motion over the real one
@@ -176,9 +177,9 @@ def plan_message(answer: Answer, first: Solution) -> str:
     seconds = first.solve_seconds if solution is first else answer.seconds
     lines.append(f"\n{solution.status.value}: {solution.result.iterations} iterations, {seconds:.2f} s")
     worst = [f"- {violation}" for violation in solution.violations[:MAX_VIOLATIONS]]
-    return "\n".join(
-        [*lines, *(["\nViolated constraints:", *worst] if worst else ["\nAll constraints are met."])]
-    )
+    # of an acceptable plan the message has what its program's constraints leave out, such as a clearance
+    met = "All constraints are met." if solution.status is Status.SOLVED else solution.result.message
+    return "\n".join([*lines, *(["\nViolated constraints:", *worst] if worst else [f"\n{met}"])])
 
 
 def failure_message(answer: Answer) -> str:

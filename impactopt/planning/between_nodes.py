@@ -59,9 +59,9 @@ class BetweenNodes:
         def solve(guess: Guess[Transcription]) -> Outcome[Transcription]:
             return solve_with_clearance(self._budget, self._margins, guess)
 
-        return self._checked(refine(outcome, [self], solve, self._budget))
+        return self.checked(refine(outcome, [self], solve, self._budget))
 
-    def _checked(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
+    def checked(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
         """Outcome checked by its replay; if bodies penetrate, the last outcome without penetration instead,
         or a failed one. Bodies that keep less than half of their clearance make it acceptable.
         """

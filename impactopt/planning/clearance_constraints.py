@@ -62,7 +62,8 @@ def same_bodies(one: ImpactProblem, other: ImpactProblem) -> bool:
     """True if clearance constraints have the same meaning in two problems."""
     if not (one.keeps_apart and other.keeps_apart) or one.robot is not other.robot:
         return False
-    if [one.swing.grading, one.follow.grading] != [other.swing.grading, other.follow.grading]:
+    phases = ((p.swing, p.follow, *(stance.phase for stance in p.stances)) for p in (one, other))
+    if len({tuple(phase and phase.grading for phase in each) for each in phases}) > 1:
         return False  # they are at other nodes
     if [body.name for body in one.bodies.world] != [body.name for body in other.bodies.world]:
         return False

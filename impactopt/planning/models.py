@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact.laws import KelvinVoigt
 from impactopt.contact.targets.base import is_order
-from impactopt.errors import InputError
+from impactopt.errors import InputError, shortened
 from impactopt.kinematics.operational_space import holding_torque
 from impactopt.planning.budget import Budget
 from impactopt.planning.contact_replay import ModelError, collision_error
@@ -62,9 +62,11 @@ def check_start(start: Solved, problem: ImpactProblem, *, motion: bool) -> None:
     """
     old = start.problem
     if old.robot.joint_names != problem.robot.joint_names:
+        differ = ", ".join(sorted({*old.robot.joint_names} ^ {*problem.robot.joint_names}))
         raise InputError(
             f"start: a solution of the robot {old.robot.name!r}, and the problem's is "
-            f"{problem.robot.name!r}; give one of the same robot"
+            f"{problem.robot.name!r}, with other joints ({shortened(differ) or 'in their order'}); "
+            "give one of the same robot with the same joints locked"
         )
     # Numbers of a scenario's target and law are parameters of the program: they may differ.
     parts = [

@@ -185,7 +185,10 @@ def _planned(
     outcome = with_gains_fixed(outcome, gains, budget)
     t, solved = outcome.program, time.perf_counter()
     # The replay is last, and of usable outcomes only.
-    outcome = replace(outcome, result=with_reason(t, outcome.result, causes, known=known)).checked()
+    outcome = replace(outcome, result=with_reason(t, outcome.result, causes, known=known))
+    # Fixing the gains has solved again, at the nodes alone.
+    again = margins if gains and refined else None
+    outcome = BetweenNodes(budget, again).checked(outcome)
     usable = outcome.usable
     solution = solution_of(
         outcome,

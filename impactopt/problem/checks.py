@@ -162,13 +162,13 @@ def check_hands(problem: Any) -> None:
 def check_motors(problem: Any) -> None:
     """InputError for a bound on motors none of which has the data, so that a plan would ignore it."""
     robot = problem.robot
-    for kind, name in ((MotorCurve, "stall_torque"), (PowerLimit, "power_limit")):
+    for kind, name, other in ((MotorCurve, "stall_torque", ""), (PowerLimit, "power_limit", "a limit, or ")):
         term = problem.extra(kind)
         limited = term is None or getattr(term, "limit", None) is not None
         if not limited and np.isnan(numbers_of(robot.actuators, name)).all():
             raise InputError(
                 f"{kind.__name__} is about motors whose {name} is known, and none of {robot.name!r} is: give "
-                "their data as [[robot.actuators]], or leave it out"
+                f"{other}their data as [[robot.actuators]], or leave it out"
             )
 
 

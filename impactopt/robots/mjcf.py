@@ -70,7 +70,8 @@ class Compiled:
         """Names of what acts on the six degrees of freedom of a root from joint j on; "" if nothing does."""
         first, names = int(self.mj.jnt_dofadr[j]), ("damping", "frictionloss", "armature")
         own = [name for name in names if self.numbers(f"dof_{name}")[first : first + 6].any()]
-        own += ["stiffness"] if np.any(self.mj.jnt_stiffness[j]) else []
+        joints = self.mj.jnt_bodyid == self.mj.jnt_bodyid[j]
+        own += ["stiffness"] if np.any(self.mj.jnt_stiffness[joints]) else []
         return " and ".join(own)
 
     def numbers(self, name: str) -> Array:
@@ -436,7 +437,9 @@ class _Reader(Compiled):
         return free or self._six(b)
 
     def _six(self, b: int) -> bool:
-        """True if three slides and three hinges, without limits and motors, move a body on the ground."""
+        """True if three slides and three hinges move a body on the ground, without limits, motors, tendons
+        or equalities.
+        """
         mj, first, kinds = self.mj, int(self.mj.body_jntadr[b]), self.mujoco.mjtJoint
         joints = np.s_[first : first + 6]
         slides = mj.jnt_type[joints] == kinds.mjJNT_SLIDE
@@ -446,7 +449,10 @@ class _Reader(Compiled):
         turns = np.all(mj.jnt_type[joints][~slides] == kinds.mjJNT_HINGE)
         spans = all(abs(np.linalg.det(axes[some])) > _SPAN for some in (slides, ~slides))
         driven = mj.actuator_trnid[mj.actuator_trntype == self.mujoco.mjtTrn.mjTRN_JOINT, 0]
-        held = mj.jnt_limited[joints].any() or np.isin(driven, np.arange(first, first + 6)).any()
+        wrapped = mj.wrap_objid[mj.wrap_type == self.mujoco.mjtWrap.mjWRAP_JOINT]
+        equal = mj.eq_type == self.mujoco.mjtEq.mjEQ_JOINT
+        tied = np.concatenate([driven, wrapped, mj.eq_obj1id[equal], mj.eq_obj2id[equal]])
+        held = mj.jnt_limited[joints].any() or np.isin(tied, np.arange(first, first + 6)).any()
         return bool(turns and spans and not held)
 
     def _add_body(self, b: int) -> None:

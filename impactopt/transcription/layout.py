@@ -417,7 +417,7 @@ class Constraints:
         spot = Place.plain(place) if isinstance(place, str) else place
         check_kind(f"{term}: place", spot, Place)
         n = len(components)
-        measures = [measure] * n if measure is None or isinstance(measure, Measure) else [*measure]
+        measures = [*measure] if isinstance(measure, Iterable) else [measure] * n
         if len(measures) != n or not all(isinstance(each, Measure | None) for each in measures):
             raise InputError(f"{term}: measure must be a Measure, or one for each component")
         try:

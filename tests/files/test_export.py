@@ -338,6 +338,19 @@ def test_a_smoothed_motion_that_leaves_the_board_whole_is_refused(tmp_path: Path
     assert json.loads(meta.read_text())["expected"]["target"] == {"broken": 1.0}
 
 
+@pytest.mark.slow
+def test_a_smoothed_motion_may_be_for_a_target_that_does_not_break(tmp_path: Path) -> None:
+    """Of another file than the plan's: the replay of the smoothed motion, and what is expected, are of it."""
+    solve(load_problem("chop_arm")).save(tmp_path / "chop")
+    text = problem_file("chop_arm").read_text(encoding="utf-8")
+    board, light = text[text.index("[target]") : text.index("[contact]")], "[target]\nmass_kg = 0.5\n\n"
+    (tmp_path / "other.toml").write_text(text.replace(board, light), encoding="utf-8")
+    given = ["--to", "csv", "--out", str(tmp_path / "csv"), "--problem", str(tmp_path / "other.toml")]
+    done = runner.invoke(app, ["export", str(tmp_path / "chop"), *given, "--smooth", "60,5000", "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["caution"].endswith("in the files are of it, the motion is the plan's")
+
+
 def test_feed_forward_beyond_the_torque_limit_is_told(planned: Planned, tmp_path: Path) -> None:
     """A smoothed motion that is near the plan's jumps accelerates beyond what its motors can."""
     path, out, robot = problem_file("arm_planar"), tmp_path / "csv", planned.problem.robot

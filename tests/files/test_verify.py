@@ -14,9 +14,10 @@ import pytest
 from support.small_plans import arm_problem
 from typer.testing import CliRunner
 
-from impactopt import InputError, load_problem, load_record
+from impactopt import InputError, load_problem, load_record, load_solution
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
+from impactopt.files.problem_file import read_problem_file
 from impactopt.files.record import Record
 from impactopt.files.verify import motion_of_record, verify_record
 from impactopt.planning.solution import Solution
@@ -210,6 +211,16 @@ def test_a_plan_by_a_model_that_is_frozen_on_the_way_is_verified(tmp_path: Path)
     assert solution.status.usable
     save_record(record_of(solution, problem=text, problem_path=ARM), tmp_path / "result")
     assert verified(tmp_path / "result", code=0)["kkt"] < 1e-5
+
+
+@pytest.mark.slow
+def test_a_plan_of_the_cheapest_model_is_verified(tmp_path: Path) -> None:
+    """Its file leaves the model open, and its program has the one that was chosen."""
+    file = read_problem_file("arm_planar", {"collision.model": "auto"})
+    plan = solve(file.build())
+    save_record(record_of(plan, problem=file.text, problem_path=file.path), tmp_path / "auto")
+    assert plan.problem.collision == "sdc" and verified(tmp_path / "auto", code=0)["ok"]
+    assert load_solution(tmp_path / "auto").problem.hash == plan.problem.hash
 
 
 def test_the_motion_is_looked_at_by_pinocchio(record: Record) -> None:

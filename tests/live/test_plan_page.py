@@ -42,8 +42,8 @@ from impactopt.files.output import record_of, save_record
 from impactopt.files.replay import problem_of, resumed
 from impactopt.live import plan_page as look_module
 from impactopt.live.drawing import moment_of
-from impactopt.live.plan_page import PlanPage
-from impactopt.live.replanning import Replanning
+from impactopt.live.plan_page import PlanPage, plan_message
+from impactopt.live.replanning import Answer, Replanning
 from impactopt.live.requests import PlanRequest, request_of, slider_parameters
 from impactopt.report.tracks import planned_track, tracks_of
 from impactopt.solvers.program import SolverResult
@@ -198,6 +198,16 @@ def test_a_legged_robot_has_a_margin_and_a_wall_no_mass(arm: Solution) -> None:
         assert request.changes(stiff) == {"stiffness": pytest.approx(4 * stiffness)}
     other = PlanRequest(point=(0.0, 0.0, 1.0), parameters=(("mass", 3.0), ("margin", 0.01)))
     assert list(other.changes(biped)) == ["point", "margin"]
+
+
+def test_an_acceptable_plan_says_what_it_lacks(arm: Solution) -> None:
+    """Its constraints at the nodes are met, but not all that the problem asks for."""
+    why = "Bodies keep less than half of their clearance: wrist and ground 6.7 mm instead of 50."
+    result = dataclasses.replace(arm.result, status=Status.ACCEPTABLE, message=why)
+    plan = dataclasses.replace(arm, result=result)
+    text = plan_message(Answer(solution=plan), arm)
+    assert why in text and "All constraints are met." not in text
+    assert "All constraints are met." in plan_message(Answer(solution=arm), arm)
 
 
 def test_between_instants_joints_are_where_the_robot_would_be(arm: Solution) -> None:

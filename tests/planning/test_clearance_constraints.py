@@ -12,7 +12,18 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
-from impactopt import Ground, ImpactProblem, KeepOut, Obstacle, Solution, Status, load_problem, solve
+from impactopt import (
+    GainFactor,
+    Ground,
+    ImpactProblem,
+    KeepOut,
+    Obstacle,
+    SelfCollision,
+    Solution,
+    Status,
+    load_problem,
+    solve,
+)
 from impactopt.bodies.clearance import Places
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
@@ -83,6 +94,18 @@ def test_starts_with_other_links_on_the_ground_have_other_bodies() -> None:
     assert (by_wrist, by_elbow) == (["wrist"], ["elbow"])
     assert not same_bodies(one, other)
     assert same_bodies(one, dataclasses.replace(one, point=one.point + np.array([0.0, 0.0, 0.01])))
+
+
+def test_stances_with_other_intervals_have_constraints_at_other_nodes() -> None:
+    """A warm start with the constraints of a step's other grading ended in a KeyError."""
+    problem = load_problem("punch_step")
+    first, *rest = problem.stances
+    assert first.phase is not None
+    graded = dataclasses.replace(first, phase=dataclasses.replace(first.phase, grading=2.0))
+    assert not same_bodies(problem, dataclasses.replace(problem, stances=(graded, *rest)))
+    assert same_bodies(
+        problem, dataclasses.replace(problem, point=problem.point + np.array([0.0, 0.0, 0.01]))
+    )
 
 
 def test_bodies_that_are_near_at_the_start_may_not_penetrate_more_than_their_rounded_shapes() -> None:
@@ -185,11 +208,22 @@ def test_a_limit_of_iterations_that_nobody_has_set_is_no_answer(free: Solution) 
 
 
 @pytest.mark.slow
-def test_a_plan_that_loses_most_of_a_clearance_is_not_called_solved() -> None:
+@pytest.mark.parametrize("gains", [(), (GainFactor(joints=["elbow"], factor=(0.5, 2.0)),)])
+def test_a_plan_that_loses_most_of_a_clearance_is_not_called_solved(gains: tuple[GainFactor, ...]) -> None:
     """The hammer's face goes to 9 mm above this floor, and may not: it drives the nail 6 mm into it."""
     problem = load_problem("arm_planar")
     terms = (*problem.terms, KeepOut(margin=0.05))
-    found = solve(dataclasses.replace(problem, ground=Ground(height=0.735), terms=terms))
+    found = solve(dataclasses.replace(problem, ground=Ground(height=0.735), terms=terms, gains=gains))
     assert found.clearance()["clearance_mm"] < 25
     assert found.status is not Status.SOLVED
     assert re.search(r"wrist and ground .* instead of 50 \(\[terms.keep_out\] margin_m", found.result.message)
+
+
+def test_a_lost_clearance_of_two_links_names_its_section(free: Solution) -> None:
+    problem = dataclasses.replace(free.problem, terms=(*free.problem.terms, SelfCollision(margin=2.0)))
+    budget, margins = Budget(solver="ipm", options=None, time_limit=None, callback=None), Margins(problem)
+    budget.stop.asked = True  # so nothing is added
+    # as far as in a start posture that is stretched out
+    margins._required = {pair: 2.0 for pair in map(tuple, margins.bodies.shapes.pairs) if pair[1] >= 0}
+    found = BetweenNodes(budget, margins).refined(Outcome.of(program_of(free, problem), free.result)).result
+    assert found.status is Status.ACCEPTABLE and "[terms.self_collision] margin_m" in found.message

@@ -40,6 +40,7 @@ from impactopt import (
     TorqueRate,
     VelocityLimit,
     load_record,
+    planar_arm,
 )
 from impactopt.cli.app import app
 from impactopt.files.problem_file import ProblemFile
@@ -486,6 +487,12 @@ def test_a_start_with_other_scenarios_is_refused(plan: Any, arm_plan: Planned) -
         told = f"solution are none, those of the problem {scenarios[0].name}, .*leave start out"
         with pytest.raises(InputError, match=told):
             plan(problem, start=start)
+
+
+def test_a_start_with_other_joints_locked_names_them(hammered: Solution) -> None:
+    robot = planar_arm(locked={"wrist": 0.47})
+    with pytest.raises(InputError, match=r"'planar_arm', with other joints \(wrist\); give one of"):
+        solve(dataclasses.replace(hammered.problem, robot=robot), start=hammered)
 
 
 def test_a_solution_starts_a_problem_with_another_objective(hammered: Solution) -> None:

@@ -199,13 +199,13 @@ def test_friction_that_takes_all_of_a_motor_is_refused(arm_transcription: Transc
         changed(arm_transcription, terms=(MotorCurve(fraction=0.5),), robot=robot)
 
 
-@pytest.mark.parametrize("term", [MotorCurve(), PowerLimit()])
-def test_a_bound_on_motors_without_data_is_refused(term: MotorCurve | PowerLimit) -> None:
+@pytest.mark.parametrize(("term", "other"), [(MotorCurve(), ""), (PowerLimit(), "a limit, or ")])
+def test_a_bound_on_motors_without_data_is_refused(term: MotorCurve | PowerLimit, other: str) -> None:
     problem = load_problem("arm_planar")
     data: dict[str, Any] = {"stall_torque": 200.0, "no_load_speed": 10.0, "power_limit": 100.0}
     known = problem.robot.with_actuators({"elbow": Actuator(**data)})
     assert replace(problem, terms=(term,), robot=known).terms == (term,)  # of one motor is enough
-    with pytest.raises(InputError, match=r"none of 'planar_arm' is: give their data as .*robot.actuators"):
+    with pytest.raises(InputError, match=rf"none of 'planar_arm' is: give {other}their data as .*robot.act"):
         replace(problem, terms=(term,))
 
 

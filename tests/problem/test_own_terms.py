@@ -244,7 +244,7 @@ def test_constraints_that_would_be_ignored_are_refused(arm_transcription: Transc
         ({"upper": np.inf}, "Own.add_constraints adds no constraint with a finite bound"),
         ({"upper": np.nan}, "own: a bound of its constraints is NaN"),
         ({"upper": [1.0, 2.0]}, r"own: a bound of its \d+ constraints is .*2.0.*; give one number"),
-        ({"measure": "mm"}, "own: measure must be a Measure, or one for each component"),
+        *(({"measure": x}, "own: measure must be a Measure, or one for each component") for x in ("mm", 1.0)),
         ({"place": None}, "own: place must be a Place, not None"),
         ({"outputs": np.array([0])}, r"Own.add_constraints: \d+ of the \d+ outputs of its blocks are in no"),
     ):

@@ -251,7 +251,10 @@ SIX = "".join(
 
 def test_six_joints_that_move_a_root_like_a_free_one_are_one(tree: Path, tmp_path: Path) -> None:
     """As in models that stem from OpenSim; a thing beside the robot on six such joints is no robot."""
-    text = TREE.replace('<freejoint name="root"/>', SIX).replace("<freejoint/>", SIX.replace("base", "ball"))
+    sprung = SIX.replace('name="base_hinge2"', 'name="base_hinge2" stiffness="5"')
+    text = TREE.replace('<freejoint name="root"/>', sprung).replace(
+        "<freejoint/>", SIX.replace("base", "ball")
+    )
     home = ".1 .2 .3 .4 .5 .6 .3 .2 0.1 2 2 0 1 1 0 0"
     text = re.sub(
         r"<keyframe>.*</keyframe>", f'<keyframe><key name="home" qpos="{home}"/></keyframe>', text, flags=re.S
@@ -259,9 +262,8 @@ def test_six_joints_that_move_a_root_like_a_free_one_are_one(tree: Path, tmp_pat
     path = tmp_path / "six.xml"
     path.write_text(text)
     read, free = read_mjcf(path), read_mjcf(tree)
-    assert read.model.nq == free.model.nq and "read as a free joint of body 'trunk', damping left out" in str(
-        read.notes
-    )
+    assert read.model.nq == free.model.nq
+    assert "read as a free joint of body 'trunk', damping and stiffness left out" in str(read.notes)
     rng = np.random.default_rng(0)
     q = pin.integrate(free.model, pin.neutral(free.model), rng.standard_normal(free.model.nv))
     masses = [np.array(pin.crba(m, m.createData(), q)) for m in (read.model, free.model)]
@@ -278,10 +280,19 @@ def test_six_joints_that_move_a_root_like_a_free_one_are_one(tree: Path, tmp_pat
     assert "ball" not in [frame.name for frame in read.model.frames]
 
 
-@pytest.mark.parametrize("held", ['<motor joint="base_slide1"/>', ""], ids=["driven", "limited"])
+@pytest.mark.parametrize(
+    "held",
+    [
+        '<actuator><motor joint="base_slide1"/></actuator>',
+        '<tendon><fixed name="rope" stiffness="9"><joint joint="base_slide1" coef="1"/></fixed></tendon>',
+        '<equality><joint joint1="base_slide1"/></equality>',
+        "",
+    ],
+    ids=["driven", "on a tendon", "at rest", "limited"],
+)
 def test_six_joints_with_a_motor_or_a_limit_are_six(tmp_path: Path, held: str) -> None:
-    text = TREE[: TREE.index("<keyframe>")] + "</mujoco>"
-    text = text.replace('<freejoint name="root"/>', SIX).replace("<actuator>", f"<actuator>{held}")
+    text = TREE[: TREE.index("<keyframe>")] + f"{held}</mujoco>"
+    text = text.replace('<freejoint name="root"/>', SIX)
     if not held:
         text = text.replace('name="base_hinge0"', 'name="base_hinge0" range="-30 30"')
     (tmp_path / "six.xml").write_text(

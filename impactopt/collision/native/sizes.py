@@ -181,10 +181,10 @@ def to_velocity_basis(frozen: FrozenDynamics) -> Any:
     return ca.Function("to_velocity_basis", [rb.q, by_q], [ca.densify(ca.mtimes(rb.tangent_map().T, by_q))])
 
 
-def c_code(name: str, functions: list[Any], *, exported: bool = False) -> str:
+def c_code(name: str, functions: list[Any], *, linkage: str = "") -> str:
     """C of static functions f(arg, res, iw, w, mem); several such texts go into one file.
 
-    exported : not static, but for all they call.
+    linkage : in place of static, but for all they call.
     """
     generator = ca.CodeGenerator(f"{name}.c", {"with_header": False})
     for function in functions:
@@ -193,9 +193,9 @@ def c_code(name: str, functions: list[Any], *, exported: bool = False) -> str:
     static = re.sub(
         r"^(casadi_real|casadi_int|void|int) casadi_", r"static \g<0>", generator.dump(), flags=re.M
     )
-    if exported:
+    if linkage:
         main = r"^CASADI_SYMBOL_EXPORT (?=int \w+\(const casadi_real\*\* arg)"
-        static = re.sub(main, "", static, flags=re.M)
+        static = re.sub(main, f"{linkage} ", static, flags=re.M)
     return f"#undef CASADI_PREFIX\n{static}\n"
 
 

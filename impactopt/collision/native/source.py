@@ -37,7 +37,7 @@ _IMPLICIT = ("", "_factor", "_step", "_remainders", "_events", "_run")  # parts 
 # for half a second more of the compiler; -O2 takes another half and gains nothing.
 _TREE = f"-O1 -fexpensive-optimizations -freciprocal-math -fschedule-insns2 {NATIVE_FLAGS}"
 _QUICK_TREE = f"-O0 {NATIVE_FLAGS}"
-_STATIC = "#define CASADI_SYMBOL_EXPORT static\n"
+_STATIC = "#define CASADI_SYMBOL_EXPORT static\n#ifndef SHARED\n#define SHARED\n#endif\n"
 _ARGUMENTS = "(const double **arg, double **res, long long *iw, double *w, int mem)"
 _OF_DIFFERENCES = 1e-12
 # Relative length of central differences. The error of implicit steps differs between two collisions, and a
@@ -195,7 +195,7 @@ def _native(
 
     parts = [
         _STATIC,
-        *(f"int {f.name()}{_ARGUMENTS};" for f in of_tree),
+        *(f"SHARED int {f.name()}{_ARGUMENTS};" for f in of_tree),
         c_code("scalars", scalars),
         f"#define GRADIENT {int(gradient or jacobian)}",
         f"#define NAME {name}\n#define OF_NAME(part) {name}_##part",
@@ -219,7 +219,8 @@ def _native(
         files_used += ["final_outputs.h", "differences.c" if differs else "collision.c"]
     code = "\n".join([*parts, *text(*files_used, "interface.c")])
     # The tree is five sixths of a humanoid's code, and the same for all laws, targets and outputs.
-    shared = "\n".join([_STATIC, *text("angles.h"), c_code("tree", of_tree, exported=True)])
+    tree_c = c_code("tree", of_tree, linkage="SHARED")
+    shared = "\n".join([_STATIC, *text("angles.h"), tree_c, "#undef sin\n#undef cos\n"])
     level = _QUICK_TREE if quick_to_compile() else _TREE
     tree_code = SharedCode(name="tree", code=shared, level=level)
     return NativeCode(name=name, code=code, graph=graph, shared=tree_code)

@@ -314,7 +314,7 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
             "give larger limits, or plan with a smaller fraction in [terms.velocity_limit]"
         )
     outcome = planned.record.summary.get("target") or {}
-    if outcome.get("broken") and not replayed.outcome["broken"]:
+    if outcome.get("broken") and not replayed.outcome.get("broken", True):
         raise InputError(
             f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "
             f"does not break the board: it presses with {replayed.peak_force:.3g} N, the plan with "

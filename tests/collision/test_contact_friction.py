@@ -148,6 +148,7 @@ def test_frozen_models_have_derivatives_with_friction() -> None:
         assert float(jacobian[f"jac_impulse_{name}"]) == pytest.approx(slope, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_gradients_with_freezes_are_those_of_differences_too() -> None:
     model, (q, v, torque) = oblique(contact_friction=GENTLE, freezes=1, accuracy=None)
     value, by_q, by_v = (np.array(x) for x in model.gradient_function()(q, v, torque))

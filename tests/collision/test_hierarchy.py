@@ -139,6 +139,7 @@ def test_freezes_converge_to_full_dynamics_with_their_square(seed, speed):
     assert impulses[-1] < 5e-4 and impulses[-1] < impulses[0] / 4, impulses
 
 
+@pytest.mark.slow
 def test_histories_of_several_freezes_go_on_from_one_to_the_next():
     robot = robot_named("talos")
     q, v, torque = situation(robot, seed=7, speed=3.0)
@@ -208,6 +209,7 @@ def test_a_rounded_hand_on_a_wall():
 
 
 # ------------------------------------------------------------ gains as matrices
+@pytest.mark.slow
 def test_matrices_of_gains_are_those_of_the_joints_if_diagonal_and_couple_joints_if_not():
     robot = small()
     q, v, torque = situation(robot, seed=4, speed=1.0, **FIST)

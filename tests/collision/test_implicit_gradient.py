@@ -129,6 +129,7 @@ def test_a_force_that_grows_until_the_horizon_has_its_peak_there():
     assert_slopes(collision, ("peak_force",), model, values, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_a_bipeds_gradient_is_that_of_exact_collisions():
     model = implicit("biped")
     values = situation("biped", model)
@@ -136,6 +137,7 @@ def test_a_bipeds_gradient_is_that_of_exact_collisions():
 
 
 # ------------------------------------------------------------ against differences of the same steps
+@pytest.mark.slow
 def test_a_standins_gradient_is_that_of_differences():
     model = implicit("standin")
     values = situation("standin", model)

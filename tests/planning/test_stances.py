@@ -80,6 +80,7 @@ def held(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> Simulation:
     return simulate_pinocchio(plan.problem.robot, ways[0], scene_of(plan.problem), settle=0.1)
 
 
+@pytest.mark.slow
 def test_a_duration_that_would_have_to_be_longer_is_that_of_its_phase(program: Transcription) -> None:
     (bound,) = (b for b in bounds_of(program) if b.name == "stance0")
     x = first_iterate(program)

@@ -345,6 +345,7 @@ def test_torques_of_a_plan_are_those_of_full_dynamics(name: str, kind: str, punc
     assert np.abs((hit.torque[at] - there) / problem.robot.torque_limit).max() < AT_POINTS
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("kind", ["solve", "strike"])
 def test_what_is_left_is_the_models_own(kind: str, tmp_path: Path, punch: Solution) -> None:

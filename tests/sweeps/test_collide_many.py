@@ -120,6 +120,7 @@ def test_rows_are_single_collisions() -> None:
         assert found["impulse_Ns"][i] == pytest.approx(mass * found["target_speed_m_s"][i], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_of_a_robot_on_soles_with_its_margins() -> None:
     columns = drawn(
         3, target__mass=(3.0, 8.0), at_contact__speed=(0.3, 1.0), at_contact__torque_limit_scale=(0.5, 1)

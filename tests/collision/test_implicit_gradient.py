@@ -84,7 +84,9 @@ ARMS = {
 
 
 @pytest.mark.usefixtures("as_shipped")
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if "wall" in name else name for name in ARMS]
+)
 def test_an_arms_gradient_is_that_of_exact_collisions(name):
     outputs, options = ARMS[name]
     model = implicit("arm", **options)

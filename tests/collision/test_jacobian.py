@@ -110,6 +110,7 @@ def test_each_column_is_that_of_differences(case):
     assert_slopes(stepped(model, outputs, values), found, model, values, np.eye(2 * model.robot.nv))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_shipped")
 def test_joints_that_saturate_and_slide_on_the_way():
     model, limit = implicit("arm", **SHORT | SLIDING | {"step": 5e-4}), np.array([30.0, 36.0, 8.0, 3.5])
@@ -131,6 +132,7 @@ def test_a_stand_in_in_random_directions():
 
 
 # ------------------------------------------------------------ against exact collisions
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [case for case in CASES if "biped" in case])
 def test_columns_are_those_of_exact_collisions(case):
     model = implicit("biped", **SHORT | CASES[case][1])

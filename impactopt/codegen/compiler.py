@@ -289,12 +289,22 @@ def library_of(
 
     def linked() -> tuple[Path, ...]:
         code = [shared.code, f"{shared.level} -c", compiler.key]
-        key = hashlib.sha256("\0".join(code).encode()).hexdigest()[:16]
-        # many functions that want it are compiled at once
-        with locked(directory / f"{slug(shared.name)}-{key}.lock", on_wait=lambda: None):
-            return (directory / _made(directory, scratch, f"{shared.name}.o", code, compiler, tuple)[0],)
+        made = f"{shared.name}.o"
+        # many functions that want it are compiled at once, and others of its name beside it
+        with (
+            locked(_file(directory, made, code).with_suffix(".lock"), on_wait=lambda: None),
+            tempfile.TemporaryDirectory(dir=scratch) as own,
+        ):
+            return (directory / _made(directory, Path(own), made, code, compiler, tuple)[0],)
 
     return _made(directory, scratch, f"{name}.so", [*parts, shared.code, shared.level], compiler, linked)
+
+
+def _file(directory: Path, name: str, parts: Sequence[str]) -> Path:
+    """Place in the cache of what is compiled; name, parts : as of `_made`."""
+    stem, suffix = os.path.splitext(name)
+    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    return directory / f"{slug(stem)}-{key[:32]}{suffix}"
 
 
 def _made(
@@ -310,9 +320,7 @@ def _made(
     name : with the suffix of its kind.  parts : code, flags, and all else that it depends on.
     linked : object files that go into it.
     """
-    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
-    stem, suffix = os.path.splitext(name)
-    file = directory / f"{slug(stem)}-{key[:32]}{suffix}"
+    file = _file(directory, name, parts)
     seal = file.with_suffix(".sha256")
     try:
         check_private_file(file)
@@ -323,7 +331,8 @@ def _made(
             return file.name, digest
     except (UnsafePath, OSError, ValueError):
         pass
-    source, made = scratch / f"{stem}.c", scratch / name
+    made = scratch / name
+    source = made.with_suffix(".c")
     source.write_text(parts[0], encoding="utf-8")
     compiler.run(source, made, parts[1], *linked())
     content = made.read_bytes()

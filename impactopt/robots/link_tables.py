@@ -25,6 +25,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.errors import InputError
 from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.robot import Robot, Striker, Tool
 
@@ -195,6 +196,8 @@ def _arm(
     whole: Any, links: tuple[Link, ...], ready: Mapping[str, float], locked: Locked, options: dict[str, Any]
 ) -> Robot:
     """An arm with its servo and its posture `ready` (angles by joint), without its locked joints."""
+    if "floating" in options:
+        raise InputError(f"floating: the base of {whole.name!r} is as it is; leave it out, or load a URDF")
     model = lock_joints(whole, locked)
     joints = joint_names(model)
     own = {

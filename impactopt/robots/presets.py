@@ -16,7 +16,7 @@ from typing import Any, ParamSpec
 import numpy as np
 import pinocchio as pin
 
-from impactopt.errors import InputError, check_choice, missing_package
+from impactopt.errors import check_choice, missing_package
 from impactopt.robots import link_tables
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source
@@ -289,14 +289,11 @@ _PRESETS: dict[str, Callable[..., Robot]] = {
     "arm7": arm7,
     "space_arm": space_arm,
 }
-_ARMS = ("planar_arm", "arm7", "space_arm")
 
 
 def load_robot(name: str, /, **overrides: Any) -> Robot:
     """The preset of that name; `overrides` go to its function, such as `standin`."""
     check_choice("no robot", name, _PRESETS)
-    if "floating" in overrides and name in _ARMS:
-        raise InputError(f"floating: the base of {name!r} is as it is; leave it out, or load a URDF")
     return _PRESETS[name](**overrides)
 
 

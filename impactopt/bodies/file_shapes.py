@@ -104,10 +104,9 @@ def _urdf_solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | Non
         with contextlib.suppress(ValueError, RuntimeError, OSError, KeyError):
             if shape.tag == "box":
                 return box(numbers(shape.attrib["size"]))
-            if shape.tag == "cylinder":
-                return cylinder(*(float(numbers(shape.attrib[key], 1)[0]) for key in ("radius", "length")))
-            if shape.tag == "capsule":
-                return capsule(*(float(numbers(shape.attrib[key], 1)[0]) for key in ("radius", "length")))
+            if shape.tag in ("cylinder", "capsule"):
+                make = cylinder if shape.tag == "cylinder" else capsule
+                return make(*(float(numbers(shape.attrib[key], 1)[0]) for key in ("radius", "length")))
             if shape.tag == "sphere":
                 return sphere(float(numbers(shape.attrib["radius"], 1)[0]))
             if shape.tag == "mesh":

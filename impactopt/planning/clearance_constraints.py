@@ -358,15 +358,18 @@ END_FRACTION = 0.2  # of the interval of two nodes: a new one stays so far from 
 class ClearanceViolations(NamedTuple):
     """Clearance violations of a solution, and the additions to its program that they require.
 
-    constraints : to replace the program's own of the same keys.  depth [m] : deepest penetration, negative if
-    there is none.  nearest [m] : least distance of the bodies that violate their clearance.  nodes : all
-    further nodes of the program, those to add included.
+    constraints : to replace the program's own of the same keys.  nearest [m] : least distance of the bodies
+    that violate their clearance.  nodes : all further nodes of the program, those to add included.
     """
 
     constraints: Constraints
-    depth: float
     nearest: Mapping[Pair, float]
     nodes: MoreNodes
+
+    @property
+    def depth(self) -> float:
+        """Deepest penetration [m], negative if there is none."""
+        return -min(self.nearest.values())
 
 
 class _Approach(NamedTuple):
@@ -422,7 +425,7 @@ def clearance_violations(
             raised.add(adjacent, pair, approach.distance)
     # the nearest approach of a pair last: it stays in the table
     nearest = {pair: near.distance for pair, near in sorted(approaches, key=lambda a: -a[1].distance)}
-    return ClearanceViolations(raised.constraints, -min(nearest.values()), nearest, added.all)
+    return ClearanceViolations(raised.constraints, nearest, added.all)
 
 
 def deepest_penetration(t: ContactProgram, x: Array, margins: Margins) -> tuple[float, list[Pair]]:

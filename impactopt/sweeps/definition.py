@@ -394,16 +394,15 @@ def _checked(data: dict[str, Any], path: Path, text: str, lines: Mapping[Place, 
         _check_collisions(path, base, content, design)
     else:
         reader.check_values(grid, listed, over)
-    if content.figure is not None:
-        mistakes += unused_in_figure(content.figure)
+    figure = None if content.figure is None else content.figure.renamed(reader.full_name)
+    if figure is not None:
+        mistakes += [*unused_in_figure(figure), *_cells_without_case(figure, design)]
         results, prefixes = given.outputs, tuple[str, ...]()
         if given.case_kind != "collision":
             names = (str(scenario["name"]) for scenario in base.data.get("scenarios", ()))
             scenarios = (f"{name.replace(' ', '_')}_" for name in names)
             results, prefixes = PLAN_COLUMNS, (*PLAN_PREFIXES, *scenarios)
         known = [*reader.names, *results]
-        figure = content.figure.renamed(reader.full_name)
-        mistakes += _cells_without_case(figure, design)
         for name in figure.columns:
             if name not in known and not name.startswith(prefixes):
                 text = f"{name!r} is neither varied nor among the outputs{did_you_mean(name, known)}"
@@ -417,7 +416,7 @@ def _checked(data: dict[str, Any], path: Path, text: str, lines: Mapping[Place, 
         design=design,
         settings=given,
         at_contact=content.at_contact,
-        figure=None if content.figure is None else content.figure.renamed(reader.full_name),
+        figure=figure,
     )
 
 

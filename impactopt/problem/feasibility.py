@@ -153,13 +153,15 @@ def unusual(problem: ImpactProblem) -> list[str]:
 
 def without_effect(problem: ImpactProblem) -> list[str]:
     """Messages about terms that bound nothing, as the robot stands on no soles."""
+    if problem.soles:
+        return []
     kinds = (Balance, ContactWrenchCone, GroundForce, LegExtension)
     given = [term for term in problem.terms if isinstance(term, kinds) and term not in DEFAULT_TERMS]
     return [
-        f"[terms.{snake_case(type(term).__name__)}] has no effect: it is of soles on the ground, and the "
-        "robot has none"
+        f"[terms.{snake_case(type(term).__name__)}] has no effect: it is of soles on the ground, and none "
+        "stands there"
         for term in given
-        if not problem.soles and getattr(term, "enabled", True)
+        if getattr(term, "enabled", True)
     ]
 
 

@@ -130,11 +130,9 @@ def test_nothing_beyond_its_bounds_and_nothing_undefined(tmp_path: Path, name: s
     code = made_of(one)
     numbers = np.concatenate([np.ravel(x, order="F") for x in situation("arm", one)]).tolist()
     source, program = tmp_path / "program.c", tmp_path / "program"
-    tree = tmp_path / "tree.c"
-    tree.write_text(code.shared.code, encoding="utf-8")
-    source.write_text(f"{code.code}\n{MAIN % ', '.join(map(repr, numbers))}", encoding="utf-8")
+    source.write_text(f"{code.whole}\n{MAIN % ', '.join(map(repr, numbers))}", encoding="utf-8")
     flags = [*SANITIZERS, "-O0", "-w", "-march=native", *BRANCHES[branch]]
-    command = [*compiler.command, *flags, str(source), str(tree), "-o", str(program), "-lm"]
+    command = [*compiler.command, *flags, str(source), "-o", str(program), "-lm"]
     made = subprocess.run(command, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr[:3000]
     done = subprocess.run([str(program)], capture_output=True, text=True, check=False)

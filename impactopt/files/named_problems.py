@@ -64,6 +64,8 @@ def _file(name: str | os.PathLike[str], named: Mapping[str, Path], kind: str) ->
             f"a {kind} is given by its name or its file, and this is of type {type(name).__name__}{text}"
         ) from None
     if path.suffix or len(path.parts) != 1 or is_plain_file(path):
+        if str(path) == f"{path.stem}.toml" and path.stem in named and not path.exists():
+            raise InputError(f"there is no file {path} here; the package's {kind} is named {path.stem!r}")
         return path
     if path.name not in named:
         raise InputError(

@@ -109,6 +109,9 @@ def reached(
     y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)
+    if down := _descent(c, y, _GUESSED_EXTENSION * limits.extension.minimum) if c.soles else 0.0:
+        y[2] -= down
+        legs = c.solve_legs(y, legs)
     bounds = p.extra(TargetSpeed)
     if p.order or bounds is not None:
         mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]

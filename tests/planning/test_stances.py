@@ -109,6 +109,20 @@ def test_a_step_without_the_time_for_it_names_its_phase() -> None:
     assert longer.stances[1].phase is not None and longer.stances[1].phase.duration[0] > 0.2
 
 
+@pytest.mark.slow
+def test_an_initial_guess_has_no_straight_leg_at_contact() -> None:
+    """Near a straight knee, where this contact posture is, the legs' rates grow without bound."""
+    problem = load_problem("punch_step")
+    steps = dataclasses.replace(problem.stances[-1], steps={"left": (0.28, 0.0)})
+    problem = dataclasses.replace(problem, stances=(*problem.stances[:-1], steps))
+    c = problem.coordinates
+    assert c.leg_extension(c.split(problem.contact_posture)[1]).min() < 0.05
+    t = transcribed(problem)
+    values = t.program.constraints(first_iterate(t))
+    worst = np.maximum(t.program.g_lower - values, values - t.program.g_upper).max()
+    assert worst < 10  # 5800 with the straight leg
+
+
 def test_effort_after_a_stance_phase_has_the_first_node_of_the_swing() -> None:
     """The objective's value is the trapezoidal sum of all nodes of swing and follow-through."""
     t = transcribed(stepping(objectives=(Effort(weight=1.0),)))

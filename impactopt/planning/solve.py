@@ -45,7 +45,7 @@ from impactopt.planning.strike import clear_strike
 from impactopt.problem.feasibility import blocked, hopeless
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.strength import strongest_posture
+from impactopt.problem.strength import drawn_posture, strongest_posture
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.mesh import NO_MORE
@@ -91,9 +91,10 @@ def solve(
         variables; or the solution of a similar problem, such as the same with its target moved by a few
         centimetres.
     starts : int
-        Number of initial guesses. All but the first one have perturbed postures and other speeds, drawn by
-        `seed`. The best motion is kept; ``Solution.attempts`` has all. If bodies penetrate each other in all
-        solutions, up to two more guesses are tried, unless two have ended alike.
+        Number of initial guesses. All but the first one have other postures at contact, perturbed, and other
+        speeds, drawn by `seed`. The best motion is kept; ``Solution.attempts`` has all. If bodies penetrate
+        each other in all solutions, up to two more guesses are tried, unless two have ended alike. If an arm
+        has no motion from any, one more guess has another posture.
     seed : int
         Seed of the drawn initial guesses.
     options : mapping, optional
@@ -172,8 +173,8 @@ def _planned(
     # A solution of a similar problem is more than an estimate, so with one all iterations are allowed.
     outcome = _best(guesses, len(which), solver, doubted=bool(doubts) and not isinstance(given, SolverResult))
     violated = ended_with_violations(outcome.program, outcome.result)
-    if isinstance(given, str) and given == "reach" and violated and not budget.is_over():
-        outcome = _else_from_plain_posture(t, outcome, solver)
+    if isinstance(given, str) and given == "reach" and violated and not doubts and not budget.is_over():
+        outcome = _else_from_other_posture(t, outcome, solver)
     if refined and margins is None:
         outcome = solver.on(outcome)
     # Reasons that need no search come first.
@@ -324,18 +325,22 @@ def _best(
     return outcome.else_then(solver.from_guess(Guess(program=program, start=result)))
 
 
-def _else_from_plain_posture(
+def _else_from_other_posture(
     t: Transcription, outcome: Outcome[Transcription], solver: PlanSolver
 ) -> Outcome[Transcription]:
-    """Outcome of a guess with the problem's posture at contact, if failed ones had another; else the old one.
+    """Outcome of a guess with another posture at contact, after guesses that failed; the old one if there is
+    none.
 
-    From the strongest posture there may be no motion, such as to a soft board that breaks.
+    From the strongest posture there may be no motion, such as to a soft board that breaks; nor from the one
+    nearest to the start, where an arm bends the other way.
     """
-    posture = t.problem.contact_posture
-    if np.array_equal(strongest_posture(t.problem), posture):
-        return outcome
-    solver.budget.say("no motion was found: solving again from the posture at contact nearest to the start")
-    return outcome.else_then(solver.from_guess(Guess(program=t, start=first_iterate(t, posture=posture))))
+    p, used = t.problem, strongest_posture(t.problem)
+    for posture in (p.contact_posture, drawn_posture(p)):
+        if not np.array_equal(posture, used):
+            solver.budget.say("no motion was found: solving again from another posture at contact")
+            guess = Guess(program=t, start=first_iterate(t, posture=posture))
+            return outcome.else_then(solver.from_guess(guess))
+    return outcome
 
 
 def _diagnosed(

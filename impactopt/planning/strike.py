@@ -103,7 +103,7 @@ def optimize_strike(
 
     method : "collocation", the only one: the full equations of motion during contact.
     solver, options, time_limit, report, callback : as of :func:`impactopt.solve`.
-    starts : number of initial guesses; all but the first one have perturbed postures and other speeds, drawn
+    starts : number of initial guesses; all but the first one have other postures and speeds, drawn
         by ``seed``. The best strike is kept; ``StrikeSolution.attempts`` has all.
     workers : number of processes that solve these; with more than one, ``callback`` is not allowed.
     start : initial guess instead: solver variables (n,), or the solution of a similar problem.

@@ -33,7 +33,7 @@ POSTURES, MAX_DRAWN = 1000, 20000
 MIN_POSTURES = 100  # with the link behind the target's plane; where there are fewer, others count, too
 POINT_POSTURES = 8  # postures at the hit point of a problem: random ones, and near the hardest impacts
 NEARBY = 0.4  # [m] from a problem's point
-# Attempts of `strongest_posture`. Measured on 17 targets of five arms: the best of 10 leads to a motion for
+# Attempts of `drawn_posture`. Measured on 17 targets of five arms: the best of 10 leads to a motion for
 # 16 of them, that of 6 for 14.
 ATTEMPTS = 12
 # Decay of an estimate with the time that joints need to a posture, over the longest swing. 2 to 5 choose
@@ -233,34 +233,30 @@ def drawn_impacts(
 def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
     """Posture at contact (nq,) for the initial guess of a motion.
 
-    It is the problem's `contact_posture`, unless the robot has a fixed base and that posture violates
-    `HandOrientation`. Then inverse kinematics starts from `ATTEMPTS` random postures. Of the results that
-    have the orientation without penetration, the posture with the largest estimated impulse is taken,
-    decreased with the time that the joints need from the start posture.
-
-    seed : of the random postures.
+    seed : that of `drawn_posture`; with 0, of the first start, it is the problem's `contact_posture` if the
+        hand has its orientation there.
     """
-    p, robot, hand = problem, problem.robot, problem.extra(HandOrientation)
-    if hand is None or robot.floating or p.second is not None:
-        return p.contact_posture
-    model, data = robot.model, robot.model.createData()
-    frame = model.getFrameId(robot.striker(p.striker).model_frame)
-    facing = np.array(hand.axis), p.normal if hand.direction is None else np.array(hand.direction)
-    min_cosine = float(np.cos(hand.angle))
+    posture = problem.contact_posture
+    return posture if not seed and _faces(problem, posture) else drawn_posture(problem, seed)
 
-    def faces(q: Array) -> bool:
-        pin.framesForwardKinematics(model, data, q)
-        return bool((data.oMf[frame].rotation @ facing[0]) @ facing[1] >= min_cosine)
 
-    if faces(p.contact_posture):
-        return p.contact_posture
+def drawn_posture(problem: ImpactProblem, seed: int = 0) -> Array:
+    """Strongest posture at contact (nq,) that inverse kinematics finds from `ATTEMPTS` random postures.
+
+    Of the results that have the hand's orientation without penetration, the posture with the largest
+    estimated impulse is taken, decreased with the time that the joints need from the start posture. It is the
+    `contact_posture` if there is none, and of robots on soles or with two striking points.
+    """
+    p, robot = problem, problem.robot
+    best, chosen = 0.0, p.contact_posture
+    if robot.floating or p.second is not None:
+        return chosen
     strength = Strength(robot=robot, striker=p.striker, law=p.law, target=p.target)
     start = robot.joint_positions(p.start_posture)
-    best, chosen = 0.0, p.contact_posture
     for guess in random_postures(robot, p.striker, p.start_posture, ATTEMPTS, seed):
         with suppress(InputError):
-            q = inverse_kinematics(p.coordinates, p.striker, p.point, guess, facing=facing, starts=1)
-            if not faces(q) or (p.keeps_apart and touches(p, q)):
+            q = inverse_kinematics(p.coordinates, p.striker, p.point, guess, facing=_facing(p), starts=1)
+            if not _faces(p, q) or (p.keeps_apart and touches(p, q)):
                 continue
             needed = float(np.max(np.abs(robot.joint_positions(q) - start) / robot.velocity_limit))
             decay = np.exp(-DECAY * needed / p.swing.duration[1])
@@ -270,6 +266,25 @@ def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
             if estimate > best:
                 best, chosen = estimate, q
     return chosen
+
+
+def _facing(problem: ImpactProblem) -> tuple[Array, Array] | None:
+    """Axis of the striker's frame and the direction in the world (3,) that `HandOrientation` requires."""
+    hand = problem.extra(HandOrientation)
+    if hand is None:
+        return None
+    return np.array(hand.axis), problem.normal if hand.direction is None else np.array(hand.direction)
+
+
+def _faces(problem: ImpactProblem, q: Array) -> bool:
+    """True if a configuration (nq,) has the hand's orientation, or none is required."""
+    hand, facing = problem.extra(HandOrientation), _facing(problem)
+    if hand is None or facing is None:
+        return True
+    model, data = problem.robot.model, problem.robot.model.createData()
+    frame = model.getFrameId(problem.robot.striker(problem.striker).model_frame)
+    pin.framesForwardKinematics(model, data, q)
+    return bool((data.oMf[frame].rotation @ facing[0]) @ facing[1] >= np.cos(hand.angle))
 
 
 def drawn_ranges(robot: Robot) -> tuple[Array, Array]:

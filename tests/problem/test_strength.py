@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,32 @@ def test_the_chosen_posture_reaches_and_faces_the_target(seed: int) -> None:
 def test_robots_on_soles_have_the_nearest_posture() -> None:
     problem = load_problem("punch_standin")
     assert np.array_equal(strongest_posture(problem, 1), problem.contact_posture)
+
+
+def _aside() -> ImpactProblem:
+    """Hit point from whose nearest posture, which faces the target, there is no motion."""
+    problem = load_problem("arm7")
+    problem = replace(problem, point=problem.point + np.array([-0.0255, 0.0739, 0.0271]))
+    hand = problem.extra(HandOrientation)
+    assert hand is not None and _off(problem, problem.contact_posture)[1] <= hand.angle
+    return problem
+
+
+def test_further_starts_have_other_postures() -> None:
+    problem = _aside()
+    postures = [strongest_posture(problem, seed) for seed in range(3)]
+    assert np.array_equal(postures[0], problem.contact_posture)
+    for one, other in pairwise(postures):
+        assert np.abs(one - other).max() > 0.1
+    for q in postures:
+        assert _off(problem, q)[0] < 1e-6
+
+
+@pytest.mark.slow
+def test_an_arm_without_a_motion_from_one_posture_is_tried_from_another() -> None:
+    """It was "infeasible: time", with 20 % more time that would do."""
+    solution = solve(_aside())
+    assert solution.status.usable and solution.impulse > 8.0 and len(solution.attempts) == 2
 
 
 @pytest.mark.slow

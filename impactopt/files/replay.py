@@ -112,6 +112,11 @@ class Planned:
     missed: Trajectory | None = None
     controller: ControllerSettings = field(default_factory=ControllerSettings)
 
+    @property
+    def of_other_problem(self) -> bool:
+        """True if `problem` is known not to be the one that the record's plan was made for."""
+        return self.record.summary.get("problem", {}).get("hash") not in (None, self.problem.hash)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:

@@ -817,6 +817,16 @@ def test_a_problem_file_that_is_not_the_plans_is_told(planned: Planned, tmp_path
         assert ("is not the problem of this plan" in done.stdout) == told
         done = runner.invoke(app, ["export", str(tmp_path / "arm"), *out, "--json"])
         assert ("caution" in json.loads(done.stdout)) == told
+        page = tmp_path / "page.html"
+        done = runner.invoke(app, ["show", str(tmp_path / "arm"), "--out", str(page), "--problem", str(file)])
+        assert done.exit_code == 0, done.output
+        for text in (done.stdout, page.read_text(encoding="utf-8")):
+            assert ("is not the problem of this plan" in text) == told
+        done = runner.invoke(
+            app, ["show", str(tmp_path / "arm"), "--sheet", str(tmp_path / "s.png"), "--problem", str(file)]
+        )
+        assert done.exit_code == 0, done.output
+        assert ("is not the problem of this plan" in done.stdout) == told
 
 
 def test_the_command_knows_all_formats() -> None:

@@ -16,7 +16,7 @@ from support.fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_so
 from support.small_robots import biped
 from typer.testing import CliRunner
 
-from impactopt import Board, ImpactProblem, InputError, KelvinVoigt, Obstacle, Solution, load_robot
+from impactopt import Board, ImpactProblem, InputError, KelvinVoigt, Obstacle, Solution, Status, load_robot
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.visuals import surroundings_of, visuals_of
 from impactopt.cli.app import app
@@ -24,6 +24,7 @@ from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
 from impactopt.files.record import Record
 from impactopt.report.animation import animation_of
+from impactopt.report.comparison import compare
 from impactopt.report.page import unpack
 from impactopt.report.report import report_of
 from impactopt.report.robot_page import bodies_page
@@ -148,6 +149,31 @@ def test_the_command_writes_the_page_into_the_result(tmp_path: Path, record: Rec
     named = runner.invoke(app, ["show", str(tmp_path / "out"), "--out", str(tmp_path / "new" / "a.html")])
     assert named.exit_code == 0 and (tmp_path / "new" / "a.html").is_file()
     assert runner.invoke(app, ["show", str(tmp_path / "none")]).exit_code == 2
+
+
+def _cards(record: Record, **numbers: Any) -> list[tuple[str, str, str]]:
+    """Class, value and text of each card of a page without the motion; numbers : of its summary."""
+    html = report_of(Record(summary={**record.summary, **numbers}, problem="", arrays={})).html
+    return re.findall(r'<div class="card"><b class="(.*?)">(.*?)</b><span>(.*?)</span>', html)
+
+
+def test_a_page_and_a_comparison_take_the_same_status_for_bad(record: Record) -> None:
+    for status in Status:
+        kind = next(kind for kind, value, _ in _cards(record, status=status.value) if value == status.value)
+        both = {
+            n: Record(summary={**record.summary, "status": status.value}, problem="", arrays={}) for n in "ab"
+        }
+        row = next(row for row in compare(both).rows if row.label == "status")
+        assert (kind != "bad") == row.cells[0].good == status.usable
+
+
+def test_the_least_margin_of_a_sole_is_beside_what_its_own_phase_requires(record: Record) -> None:
+    margins = {"left": {"swing": 29.6, "collision": 46.0, "follow": 22.0}, "right": {"swing": 29.9}}
+    asked = {"swing": 30.0, "collision": 20.0, "follow": 30.0}
+    cards = _cards(record, sole_cop_margin_mm=margins, sole_cop_margin_asked_mm=asked)
+    ((kind, value, about),) = (card for card in cards if "centre of pressure" in card[2])
+    assert (kind, value) == ("", "22 mm") and "follow" in about
+    assert "30\u202fmm required" in about and "20\u202fmm" not in about
 
 
 # ---- in a browser

@@ -286,6 +286,24 @@ def test_the_animation_works(seen: list[dict[str, Any]], record: Record, solutio
     np.testing.assert_allclose(np.reshape(wide["place"], (-1, 4, 4)), places, atol=1e-5)
 
 
+@pytest.mark.slow
+def test_of_a_motion_with_steps_the_polygon_is_named_as_that_at_contact(
+    record: Record, solution: Solution, tmp_path: Path
+) -> None:
+    """It is drawn in all phases, also while the robot stands on one foot."""
+    stances = [{"soles": ["left", "right"], "from_s": 0.0, "to_s": 1.0}]
+    stepping = dataclasses.replace(record, summary={**record.summary, "stances": stances})
+    marks = "document.querySelector('.marks').innerText.split('\\n').map((text) => text.trim())"
+    pages = [
+        report_of(each, solution.problem).save(tmp_path / f"{name}.html")
+        for name, each in (("still", record), ("stepping", stepping))
+    ]
+    still, stepping_seen = visit(*(Job(page=page, scripts=(marks,)) for page in pages))
+    for seen, name in ((still, "support polygon"), (stepping_seen, "support polygon at contact")):
+        assert seen.console == []
+        assert [text for text in seen.values[0] if "polygon" in text] == [name]
+
+
 def test_a_target_that_flies_off_fades(seen: list[dict[str, Any]]) -> None:
     assert seen[0]["seen"] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0]), "over the second half of its way"
 

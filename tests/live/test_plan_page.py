@@ -9,7 +9,7 @@ import subprocess
 import sys
 import types
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.parse import quote, urlsplit
@@ -140,6 +140,33 @@ def test_a_fault_of_ours_is_told_and_leaves_the_old_plan(
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
+def test_controls_that_move_while_a_plan_is_drawn_leave_the_page_planning(
+    arm: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plan that is drawn is then not of the controls, though there was no newer request before."""
+    told, pages = list[str](), list[PlanPage]()
+
+    class Answering(Replanning):
+        def __call__(self, request: PlanRequest, stale: Callable[[], bool]) -> Answer:
+            told.extend(page.status.content for page in pages)
+            return super().__call__(request_of(arm.problem), stale)
+
+    monkeypatch.setattr(look_module, "Replanning", Answering)
+    with PlanPage(arm) as look:
+        pages.append(look)
+        assert look.status.order < look.text.order, "it is above the numbers that it is about"
+
+        def drawn(answer: Answer, first: Solution) -> str:
+            look.sliders["stiffness"].value *= 1.01 if len(told) == 1 else 1.0
+            look.changed()
+            return plan_message(answer, first)
+
+        monkeypatch.setattr(look_module, "plan_message", drawn)
+        look.sliders["mass"].value *= 1.1
+        assert look.wait(LONG)
+        assert told == ["Planning ...", "Planning ..."] and look.status.content == ""
+
+
 def test_a_stale_request_stops_the_solver(arm: Solution) -> None:
     replanning = Replanning(arm)
     request = request_of(arm.problem)
@@ -184,6 +211,8 @@ def test_a_legged_robot_has_a_margin_and_a_wall_no_mass(arm: Solution) -> None:
     assert [n.name for n in slider_parameters(arm.problem)] == ["mass", "stiffness"]
     biped = biped_problem()
     assert [n.name for n in slider_parameters(biped)] == ["mass", "stiffness", "margin"]
+    # `moved(margin=...)` is that of each sole; the page's ZMP margins are of their hull
+    assert slider_parameters(biped)[-1].label == "margin of the soles' CoP [m]"
     wall = dataclasses.replace(biped, target=RigidWall())
     assert [n.name for n in slider_parameters(wall)] == ["stiffness", "margin"]
     for number in slider_parameters(biped):

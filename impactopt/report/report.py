@@ -38,10 +38,12 @@ def report_of(record: Record, problem: ImpactProblem | None = None) -> Page:
         arrays |= solids
     title = str(record.summary.get("problem", {}).get("name", "")) or "result"
     known = record.summary.get("problem", {})
+    about = [str(known[key]) for key in ("robot", "striker") if known.get(key)]
+    about += ["the impact alone, without a motion"] if "strike_posture" in record.arrays else []
     html = report_html(
         title=title,
         heading=title,
-        about=" · ".join(str(known[key]) for key in ("robot", "striker") if known.get(key)),
+        about=" · ".join(about),
         parts=_parts(record, animated=bool(header)),
         header={**header, "charts": charts},
         arrays=arrays,

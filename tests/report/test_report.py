@@ -176,6 +176,27 @@ def test_the_least_margin_of_a_sole_is_beside_what_its_own_phase_requires(record
     assert "30\u202fmm required" in about and "20\u202fmm" not in about
 
 
+def test_a_strikes_page_has_its_numbers_and_says_what_it_is(record: Record) -> None:
+    """It had the state at contact in no row, and looked like the page of a motion."""
+    numbers = {
+        "zmp_margin_m": {"contact": 0.0813, "collision": 0.0212},
+        "torque_ratio": {"contact": 0.83, "collision": 0.84},
+        "capture_margin_m": 0.0904,
+    }
+    summary = {k: v for k, v in record.summary.items() if k not in ("simulated", "replayed")} | numbers
+    strike = Record(summary=summary, problem="", arrays={"strike_posture": np.zeros(3)})
+    text = Reader(report_of(strike).html).text
+    assert "the impact alone" in text
+    for label, value in (
+        ("ZMP margin [mm], contact", "81.3"),
+        ("ZMP margin [mm], collision", "21.2"),
+        ("torque demand / limit, contact", "0.83"),
+        ("capture point's margin after contact [mm]", "90.4"),
+    ):
+        assert f"{label}{value}" in "".join(text.split("\n"))
+    assert "the impact alone" not in Reader(report_of(record).html).text
+
+
 # ---- in a browser
 
 WIDE = "document.documentElement.scrollWidth <= innerWidth"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import re
 from html.parser import HTMLParser
@@ -308,21 +309,26 @@ def test_the_animation_works(seen: list[dict[str, Any]], record: Record, solutio
 
 
 @pytest.mark.slow
-def test_of_a_motion_with_steps_the_polygon_is_named_as_that_at_contact(
-    record: Record, solution: Solution, tmp_path: Path
-) -> None:
-    """It is drawn in all phases, also while the robot stands on one foot."""
+def test_what_is_drawn_is_named_as_what_it_is(record: Record, solution: Solution, tmp_path: Path) -> None:
+    """One polygon is drawn in all phases of a motion with steps, one arrow for two hands."""
     stances = [{"soles": ["left", "right"], "from_s": 0.0, "to_s": 1.0}]
     stepping = dataclasses.replace(record, summary={**record.summary, "stances": stances})
+    two_hands = copy.copy(solution.problem)
+    object.__setattr__(two_hands, "second", "another hand")  # the biped has one
     marks = "document.querySelector('.marks').innerText.split('\\n').map((text) => text.trim())"
-    pages = [
-        report_of(each, solution.problem).save(tmp_path / f"{name}.html")
-        for name, each in (("still", record), ("stepping", stepping))
-    ]
-    still, stepping_seen = visit(*(Job(page=page, scripts=(marks,)) for page in pages))
-    for seen, name in ((still, "support polygon"), (stepping_seen, "support polygon at contact")):
+    usual = report_of(record, solution.problem).save(tmp_path / "usual.html")
+    other = report_of(stepping, two_hands).save(tmp_path / "other.html")
+    found = visit(Job(page=usual, scripts=(marks,)), Job(page=other, scripts=(marks,)))
+    for seen, names in zip(
+        found,
+        (
+            ["force on the target", "support polygon"],
+            ["force of both hands on the target", "support polygon at contact"],
+        ),
+        strict=True,
+    ):
         assert seen.console == []
-        assert [text for text in seen.values[0] if "polygon" in text] == [name]
+        assert [text for text in seen.values[0] if "target" in text or "polygon" in text] == names
 
 
 def test_a_target_that_flies_off_fades(seen: list[dict[str, Any]]) -> None:

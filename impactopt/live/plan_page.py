@@ -167,7 +167,9 @@ def plan_message(answer: Answer, first: Solution) -> str:
         f"- {plan.hand_speed:.2f} m/s at contact",
     ]
     if duration > 0:
-        lines.append(f"- {plan.collision.peak_force:.0f} N at most, for {1e3 * duration:.1f} ms")
+        replay = solution.contact_replay  # the program's points may miss the peak by some per cent
+        peak = plan.collision.peak_force if replay is None else replay.peak
+        lines.append(f"- {peak:.0f} N at most, for {1e3 * duration:.1f} ms")
     for name, label, unit, factor in (
         ("zmp_margin_m", "ZMP margin", " mm", 1e3),
         ("torque_ratio", "torque", " % of its limit", 1e2),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -237,6 +238,18 @@ def test_an_acceptable_plan_says_what_it_lacks(arm: Solution) -> None:
     text = plan_message(Answer(solution=plan), arm)
     assert why in text and "All constraints are met." not in text
     assert "All constraints are met." in plan_message(Answer(solution=arm), arm)
+
+
+@pytest.mark.slow
+def test_the_largest_force_on_a_page_is_that_of_full_dynamics() -> None:
+    """The points of this nail's contact miss its peak by 6 %."""
+    nail = solve(load_problem("arm7"))
+    mass = 1.1 * nail.problem.target.parameters["mass"]
+    for plan in (nail, moved_solution(nail, mass=mass)):
+        peak = plan.validate().peak_force
+        found = re.search(r"(\d+) N at most", plan_message(Answer(solution=plan), nail))
+        assert found is not None and float(found[1]) == pytest.approx(peak, rel=5e-3)
+        assert plan.plan.collision.peak_force < 0.97 * peak
 
 
 def test_between_instants_joints_are_where_the_robot_would_be(arm: Solution) -> None:

@@ -12,12 +12,23 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from matplotlib.colors import to_rgb
 from support.browser import DARK, WITHOUT_3D, Job, Visit, visit
 from support.fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_solution
 from support.small_robots import biped
 from typer.testing import CliRunner
 
-from impactopt import Board, ImpactProblem, InputError, KelvinVoigt, Obstacle, Solution, Status, load_robot
+from impactopt import (
+    Board,
+    ImpactProblem,
+    InputError,
+    KelvinVoigt,
+    Obstacle,
+    Solution,
+    Status,
+    TargetBody,
+    load_robot,
+)
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.visuals import surroundings_of, visuals_of
 from impactopt.cli.app import app
@@ -27,6 +38,8 @@ from impactopt.files.record import Record
 from impactopt.report.animation import animation_of
 from impactopt.report.comparison import compare
 from impactopt.report.page import unpack
+from impactopt.report.pictures.sheet import sheet
+from impactopt.report.pictures.style import ORANGE
 from impactopt.report.report import report_of
 from impactopt.report.robot_page import bodies_page
 from impactopt.report.stage import stage_of
@@ -196,6 +209,20 @@ def test_a_strikes_page_has_its_numbers_and_says_what_it_is(record: Record) -> N
     ):
         assert f"{label}{value}" in "".join(text.split("\n"))
     assert "the impact alone" not in Reader(report_of(record).html).text
+
+
+@pytest.mark.slow
+def test_a_door_hides_the_robot_from_no_side_of_a_sheet() -> None:
+    """It covered the robot in the front view until it had moved away."""
+    orange, shown = np.array(to_rgb(ORANGE)), dict[float, list[bool]]()
+    for width in (0.18, 0.9):  # a box, a door
+        problem = still_problem(body=TargetBody(size=(width, 2 * width, 0.04)))
+        drawn = sheet(record_of(still_solution(problem=problem)), problem)
+        faces = [np.asarray(axes.collections[0].get_facecolor())[:, :3] for axes in drawn.axes[::7]]
+        # faces are shaded: their colours are along the target's
+        along = [colours / np.linalg.norm(colours, axis=1, keepdims=True) for colours in faces]
+        shown[width] = [bool((row @ orange / np.linalg.norm(orange) > 0.9999).any()) for row in along]
+    assert shown == {0.18: [True, True, True], 0.9: [False, True, True]}
 
 
 # ---- in a browser

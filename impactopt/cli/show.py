@@ -138,7 +138,8 @@ def _page(what: Path, problem: Path | None, port: int) -> PlanPage | CollisionPa
 
     if not _is_robot(what):
         planned = load_planned(what, problem_file=problem)
-        return PlanPage(resumed(planned.record, planned.problem), port=port)
+        other = problem is not None and planned.of_other_problem
+        return PlanPage(resumed(planned.record, planned.problem, other=other), port=port)
     if what.suffix != ".toml" or problem is not None:
         raise InputError(f"--live is for a result, or for a problem file alone: {str(what)!r} has no target")
     return CollisionPage(read_problem_file(what).build(), port=port)

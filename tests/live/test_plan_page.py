@@ -35,6 +35,7 @@ from impactopt import (
     Status,
     load_problem,
     load_record,
+    load_solution,
     moved_solution,
     solve,
 )
@@ -288,6 +289,21 @@ def test_a_saved_result_is_a_start_again(arm: Solution, saved: Path) -> None:
     assert again.trajectory.q == pytest.approx(arm.trajectory.q, abs=1e-12)
     mass = 1.1 * arm.problem.target.mass
     assert moved_solution(again, mass=mass).impulse == pytest.approx(arm.moved(mass=mass).impulse, rel=1e-9)
+
+
+def test_a_result_under_another_problem_is_solved_for_that(
+    arm: Solution, saved: Path, tmp_path: Path
+) -> None:
+    """The saved motion meets looser limits, too, but is no optimum within them."""
+    own, other = tmp_path / "own.toml", tmp_path / "other.toml"
+    own.write_text(FILE.read_text(encoding="utf-8"), encoding="utf-8")
+    looser = "[terms.velocity_limit]\nfraction = 1.0\n"
+    other.write_text(f"{FILE.read_text(encoding='utf-8')}\n{looser}", encoding="utf-8")
+    worth = arm.objectives["target energy"]
+    assert load_solution(saved, problem_file=own).objectives["target energy"] == worth
+    again = load_solution(saved, problem_file=other)
+    assert again.status.usable
+    assert again.objectives["target energy"] > 1.001 * worth
 
 
 @pytest.mark.parametrize("without", ["program_statement", "solver_x"])

@@ -28,7 +28,8 @@ def bodies_page(robot: Robot) -> Page:
     """Page of a robot's bodies in `USUAL_POSTURE`, else in its first posture, or else in the neutral."""
     names = sorted(robot.postures, key=lambda name: name != USUAL_POSTURE)
     posture = robot.posture(names[0]) if names else pin.neutral(robot.model)
-    return _page(robot, posture, names[0] if names else "neutral", robot.name)
+    floor = 0.0 if robot.soles else None  # without soles it has ground only where a problem gives one
+    return _page(robot, posture, names[0] if names else "neutral", robot.name, floor=floor)
 
 
 def bodies_page_of_problem(problem: ImpactProblem) -> Page:
@@ -54,7 +55,7 @@ def _page(
     *,
     world: tuple[WorldBody, ...] = (),
     normal: Array | None = None,
-    floor: float | None = 0.0,
+    floor: float | None,
 ) -> Page:
     links, arrays = bodies_of(robot), dict[str, Any]()
     header = {

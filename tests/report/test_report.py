@@ -443,6 +443,14 @@ def test_a_robots_bodies_are_drawn_over_it(shown: list[dict[str, Any]]) -> None:
     assert 0.02 < share < 0.9 and error == 0 and share > bare == 0.0
 
 
+@pytest.mark.parametrize(("name", "floor"), [("standin", 0.0), ("planar_arm", None), ("space_arm", None)])
+def test_a_robot_without_soles_is_shown_without_ground(name: str, floor: float | None) -> None:
+    """It has ground only in a problem with [ground]."""
+    numbers = re.search(r'id="numbers">(.*?)<', bodies_page(load_robot(name)).html)
+    assert numbers is not None
+    assert unpack(numbers.group(1))[0]["floor"] == floor
+
+
 def test_a_robots_page_says_which_bodies_may_touch() -> None:
     robot = biped()
     robot = dataclasses.replace(robot, disable_collisions=(("left knee", "right knee"),))

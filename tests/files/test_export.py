@@ -827,6 +827,11 @@ def test_a_problem_file_that_is_not_the_plans_is_told(planned: Planned, tmp_path
         )
         assert done.exit_code == 0, done.output
         assert ("is not the problem of this plan" in done.stdout) == told
+        replayed = ["validate", str(tmp_path / "arm"), "--problem", str(file), "-q"]
+        done = runner.invoke(app, replayed, env={"COLUMNS": "200"})
+        assert ("is not the problem of this plan" in done.stdout) == told, done.output
+        done = runner.invoke(app, [*replayed, "--json"])
+        assert ("caution" in json.loads(done.stdout)) == told
 
 
 def test_the_command_knows_all_formats() -> None:

@@ -43,6 +43,7 @@ def bodies_page_of_problem(problem: ImpactProblem) -> Page:
         title,
         world=problem.world,
         normal=problem.normal,
+        point=problem.point,
         floor=problem.ground_height,
     )
 
@@ -55,6 +56,7 @@ def _page(
     *,
     world: tuple[WorldBody, ...] = (),
     normal: Array | None = None,
+    point: Array | None = None,
     floor: float | None,
 ) -> Page:
     links, arrays = bodies_of(robot), dict[str, Any]()
@@ -65,7 +67,7 @@ def _page(
         "tracks": [pack_track("track0", _still(robot, q, f"posture: {posture}"), arrays)],
         "soles": [],
         "normal": np.array([1.0, 0.0, 0.0]) if normal is None else normal,
-        "point": arrays["track0_hand"][0],
+        "point": arrays["track0_hand"][0] if point is None else point,  # in view, and seen from its side
         "side": middle(arrays["track0_places"]),
         "weight": 1.0,
         "around": 0.0,

@@ -27,6 +27,7 @@ from impactopt import (
     Solution,
     Status,
     TargetBody,
+    load_problem,
     load_robot,
 )
 from impactopt.bodies.robot_bodies import bodies_of
@@ -41,7 +42,7 @@ from impactopt.report.page import unpack
 from impactopt.report.pictures.sheet import sheet
 from impactopt.report.pictures.style import ORANGE
 from impactopt.report.report import report_of
-from impactopt.report.robot_page import bodies_page
+from impactopt.report.robot_page import bodies_page, bodies_page_of_problem
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
 
@@ -449,6 +450,14 @@ def test_a_robot_without_soles_is_shown_without_ground(name: str, floor: float |
     numbers = re.search(r'id="numbers">(.*?)<', bodies_page(load_robot(name)).html)
     assert numbers is not None
     assert unpack(numbers.group(1))[0]["floor"] == floor
+
+
+def test_a_problems_bodies_are_seen_from_the_side_of_its_hit_point() -> None:
+    """They were seen from the side of the robot's first striker, which may be another one."""
+    problem = load_problem("kick")
+    numbers = re.search(r'id="numbers">(.*?)<', bodies_page_of_problem(problem).html)
+    assert numbers is not None
+    np.testing.assert_array_equal(unpack(numbers.group(1))[0]["point"], problem.point)
 
 
 def test_a_robots_page_says_which_bodies_may_touch() -> None:

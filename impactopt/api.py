@@ -202,7 +202,8 @@ def load_solution(
     solved again from the saved variables.
 
     result : its directory, or its `solution.npz`.
-    problem_file : used instead of the saved text, such as when the problem's URDF has moved.
+    problem_file : used instead of the saved text, such as when the problem's URDF has moved; another problem
+        is solved from the saved variables.
 
     Raises
     ------
@@ -211,7 +212,8 @@ def load_solution(
     from impactopt.files.replay import load_planned, resumed
 
     planned = load_planned(result, problem_file=problem_file)
-    return cast(Solution, _public(resumed(planned.record, planned.problem)))
+    other = problem_file is not None and planned.of_other_problem
+    return cast(Solution, _public(resumed(planned.record, planned.problem, other=other)))
 
 
 def _or_file(run: Callable[..., R]) -> Callable[..., R]:

@@ -80,8 +80,8 @@ def export(
             planned, to, directory, rate=rate, joints=names, gravity=gravity, smooth=limits
         )
         cost = None if limits is None else json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
-        own, caution = planned.record.summary.get("problem", {}).get("hash"), None
-        if problem is not None and own not in (None, planned.problem.hash):
+        caution = None
+        if problem is not None and planned.of_other_problem:
             plans = "motion and what is expected are" if limits is None else "motion is"
             caution = (
                 f"{problem} is not the problem of this plan: gains, limits, target and contact law in the "

@@ -13,6 +13,7 @@ from impactopt.cli.options import OtherProblem, out_option
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
+    from impactopt.files.replay import Planned
     from impactopt.live.collision_page import CollisionPage
     from impactopt.live.plan_page import PlanPage
     from impactopt.report.page import Page
@@ -80,11 +81,13 @@ def show(
         from impactopt.errors import printable
         from impactopt.files.output import make_directory
 
-        made, usual = _bodies(what, problem) if _is_robot(what) else _result(what, problem)
+        made, usual, caution = _bodies(what, problem) if _is_robot(what) else _result(what, problem)
         page = out if out is not None else usual
         make_directory(page.parent)
         written = made.save(page)
         typer.echo(printable(str(written)))
+        if caution:
+            typer.echo(printable(f"caution: {caution}"))
         if open_:
             webbrowser.open(written.resolve().as_uri())
 
@@ -102,6 +105,18 @@ def _sheet(result: Path, problem: Path | None, file: Path) -> None:
         planned = load_planned(result, problem_file=problem)
         write_file(file, sheet(planned.record, planned.problem).write)
         typer.echo(printable(str(file)))
+        if caution := _caution(planned, problem):
+            typer.echo(printable(f"caution: {caution}"))
+
+
+def _caution(planned: Planned, problem: Path | None) -> str:
+    """Caution about a given problem that is not the plan's; "" if there is none."""
+    if problem is None or not planned.of_other_problem:
+        return ""
+    return (
+        f"{problem} is not the problem of this plan: robot, target, ground and limits are drawn of it, the "
+        "motion and its numbers are the plan's"
+    )
 
 
 def _live(what: Path, problem: Path | None, port: int | None, open_: bool) -> None:
@@ -123,7 +138,8 @@ def _page(what: Path, problem: Path | None, port: int) -> PlanPage | CollisionPa
 
     if not _is_robot(what):
         planned = load_planned(what, problem_file=problem)
-        return PlanPage(resumed(planned.record, planned.problem), port=port)
+        other = problem is not None and planned.of_other_problem
+        return PlanPage(resumed(planned.record, planned.problem, other=other), port=port)
     if what.suffix != ".toml" or problem is not None:
         raise InputError(f"--live is for a result, or for a problem file alone: {str(what)!r} has no target")
     return CollisionPage(read_problem_file(what).build(), port=port)
@@ -136,8 +152,8 @@ def _is_robot(what: Path) -> bool:
     return what.suffix == ".toml" or (str(what) in robot_names() and not os.path.exists(what))
 
 
-def _result(result: Path, problem: Path | None) -> tuple[Page, Path]:
-    """Page of a result, and its default path."""
+def _result(result: Path, problem: Path | None) -> tuple[Page, Path, str]:
+    """Page of a result, its default path, and a caution about a problem that is not the plan's."""
     from impactopt.errors import InputError, did_you_mean
     from impactopt.files.record import load_record, near_result
     from impactopt.files.replay import load_planned
@@ -152,12 +168,17 @@ def _result(result: Path, problem: Path | None) -> tuple[Page, Path]:
             f"a problem file, or one of the robots {', '.join(robots)}"
         )
     record = load_record(result)
-    about = load_planned(result, problem_file=problem).problem if record.completed else None
-    return report_of(record, about), (result if os.path.isdir(result) else result.parent) / PAGE
+    about, caution = None, ""
+    if record.completed:
+        planned = load_planned(result, problem_file=problem)
+        about, caution = planned.problem, _caution(planned, problem)
+        notes = "; ".join(filter(None, [record.summary.get("caution"), caution]))
+        record.summary.update({"caution": notes} if notes else {})
+    return report_of(record, about), (result if os.path.isdir(result) else result.parent) / PAGE, caution
 
 
-def _bodies(what: Path, problem: Path | None) -> tuple[Page, Path]:
-    """Page of a robot's bodies, and its default path."""
+def _bodies(what: Path, problem: Path | None) -> tuple[Page, Path, str]:
+    """Page of a robot's bodies, its default path, and no caution."""
     from impactopt.errors import InputError
     from impactopt.files.problem_file import read_problem_file
     from impactopt.report.robot_page import bodies_page, bodies_page_of_problem
@@ -167,5 +188,5 @@ def _bodies(what: Path, problem: Path | None) -> tuple[Page, Path]:
         raise InputError(f"--problem is for a result, and {str(what)!r} is none: leave it out")
     page = Path(BODIES) / f"{what.stem}.html"
     if what.suffix == ".toml":
-        return bodies_page_of_problem(read_problem_file(what).build()), page
-    return bodies_page(load_robot(str(what))), page
+        return bodies_page_of_problem(read_problem_file(what).build()), page, ""
+    return bodies_page(load_robot(str(what))), page, ""

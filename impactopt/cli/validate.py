@@ -130,8 +130,13 @@ def validate(
 
                 make_directory(animation.parent)
                 written.append(save_animation(done, animation))
+        other = ""
+        if problem is not None and planned.of_other_problem:
+            other = (
+                f"{problem} is not the problem of this plan: it is replayed with its robot, target and law"
+            )
         if as_json:
-            print_json(done.report, ok)
+            print_json(done.report | ({"caution": other} if other else {}), ok)
         else:
             from impactopt.report.console import (
                 output,
@@ -145,7 +150,8 @@ def validate(
             console, summary = output(), planned.record.summary
             console.print(replay_table(done.report, summary))
             hit = world.missing or done.report["impulse_error_pct"] is not None
-            say(console, reason_message(summary), "" if hit else "the target is not hit")
+            other = f"caution: {other}" if other else ""
+            say(console, other, reason_message(summary), "" if hit else "the target is not hit")
             caution = done.record.summary.get("gear_caution")
             say(console, replayed_touches_message(done.report), caution, touch_message(done.report), *written)
         if not ok:

@@ -326,8 +326,8 @@ def keep_record(record: Record, directory: Path) -> tuple[Path, Path]:
     ------
     InputError : they cannot be written.
     """
-    good = _good(record.summary.get("status"))
-    place = _place(directory, good, _good(_status_in(directory)), record.summary)
+    good = is_usable(record.summary.get("status"))
+    place = _place(directory, good, is_usable(_status_in(directory)), record.summary)
     written = save_record(record, place)
     if good:
         _remove(directory / FAILED, NUMBERS, SUMMARY, *DERIVED)
@@ -371,7 +371,7 @@ def _place(directory: Path, good: bool, has_good: bool, summary: dict[str, Any])
     return place
 
 
-def _good(status: Any) -> bool:
+def is_usable(status: Any) -> bool:
     """True if a record's status is that of a usable result; an unknown one, of a newer version, counts so."""
     known = [s.value for s in Status if not s.usable]
     return isinstance(status, str) and status not in known

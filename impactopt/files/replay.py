@@ -37,17 +37,18 @@ from impactopt.transcription.transcription import Transcription
 _SAME = 1e-6
 
 
-def resumed(record: Record, problem: ImpactProblem) -> Solution:
+def resumed(record: Record, problem: ImpactProblem, *, other: bool = False) -> Solution:
     """The solution of a record, for a warm start; without the history of its solve.
 
     The program is rebuilt from its description in the record. If there is none, or the program differs today,
     the problem is solved again, with the record's variables as the initial guess if their number is the same.
 
     problem : the record's, as `impactopt.files.replay.load_planned` builds it.
+    other : it is not the record's, and solved again: the record may meet its constraints, and be no optimum.
     """
     made = program_of_record(record, problem)
     x = np.asarray(record.arrays["solver_x"])
-    if made is not None and _same_program(made, record):
+    if made is not None and not other and _same_program(made, record):
         return solution_of_record(record, made)
     if made is None or made.program.n != len(x):
         return solve(problem)
@@ -111,6 +112,11 @@ class Planned:
     reference: Trajectory
     missed: Trajectory | None = None
     controller: ControllerSettings = field(default_factory=ControllerSettings)
+
+    @property
+    def of_other_problem(self) -> bool:
+        """True if `problem` is known not to be the one that the record's plan was made for."""
+        return self.record.summary.get("problem", {}).get("hash") not in (None, self.problem.hash)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

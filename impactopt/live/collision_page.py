@@ -35,11 +35,12 @@ _FREEZES = 4
 class ShownCollision:
     """Collision in a posture.
 
-    q (nq,) : as drawn.  collision : None if there is none.  seconds : of the computation.  why : reason that
-    there is no collision, or that it has not ended; else "".
+    q (nq,) : as drawn.  v (nv,) : at contact.  collision : None if there is none.  seconds : of the
+    computation.  why : reason that there is no collision, or that it has not ended; else "".
     """
 
     q: Array | None = None
+    v: Array | None = None
     collision: Collision | None = None
     seconds: float = 0.0
     why: str = ""
@@ -135,7 +136,7 @@ class CollisionPage(LivePage):
         except InputError as error:
             return ShownCollision(q=q, seconds=time.perf_counter() - began, why=str(error))
         why = "" if collision.separated else "the contact does not end"
-        return ShownCollision(q=q, collision=collision, seconds=time.perf_counter() - began, why=why)
+        return ShownCollision(q=q, v=v, collision=collision, seconds=time.perf_counter() - began, why=why)
 
     def _show(self, _: Array, outcome: ShownCollision | Exception) -> None:
         if isinstance(outcome, Exception):  # an internal error, which must not end the page
@@ -181,7 +182,7 @@ class CollisionPage(LivePage):
         return zmp_margins(self.problem.robot, self._polygon, collision.ground_wrench)
 
     def _summary(self, shown: ShownCollision) -> str:
-        collision = shown.collision
+        collision, robot = shown.collision, self.problem.robot
         if collision is None:
             return f"**No collision.** {shown.why}"
         lines = [f"**{collision.impulse:.3g} N s**" + (f" ({shown.why})" if shown.why else "")]
@@ -196,8 +197,13 @@ class CollisionPage(LivePage):
                 else "- no ZMP: the ground would have to pull the soles"
             )
         if collision.demand is not None:
-            ratio = np.abs(collision.demand / self.problem.robot.torque_limit).max(axis=0)
-            worst = int(np.argmax(ratio))
-            name = self.problem.robot.joint_names[worst]
-            lines.append(f"- torque demand {100 * ratio[worst]:.0f} % of the limit ({name})")
+            lines.append(self._worst("torque demand", collision.demand / robot.torque_limit))
+        if shown.v is not None:
+            lines.append(self._worst("joint speed", shown.v[-robot.n :] / robot.velocity_limit))
         return "\n".join([*lines, f"\n{shown.seconds:.2f} s"])
+
+    def _worst(self, what: str, shares: Array) -> str:
+        """Line about the joint with the largest share (..., n) of its limit."""
+        most = np.abs(shares).reshape(-1, self.problem.robot.n).max(axis=0)
+        worst = int(np.argmax(most))
+        return f"- {what} {100 * most[worst]:.0f} % of the limit ({self.problem.robot.joint_names[worst]})"

@@ -89,8 +89,8 @@ class PlanPage(LivePage):
     def _add_controls(self) -> None:
         gui, problem = self._server.gui, self.first.problem
         gui.configure_theme(show_share_button=False, show_logo=False)
+        self.status = gui.add_markdown("")  # first, as it says whether the text below is of the controls
         self.text = gui.add_markdown("")
-        self.status = gui.add_markdown("")
         with gui.add_folder("Motion"):
             self.time = gui.add_slider("time [s]", 0.0, 1.0, 1e-3, 0.0)
             self.playing = gui.add_checkbox("play", True)
@@ -129,14 +129,15 @@ class PlanPage(LivePage):
             self.hit.position = np.array(own.point)
             self.ask(own)
 
-    def _show(self, _: PlanRequest, answer: Answer | Exception) -> None:
+    def _show(self, request: PlanRequest, answer: Answer | Exception) -> None:
         if isinstance(answer, Exception):  # an internal error, which must not end the page
             traceback.print_exception(answer)
             answer = Answer(why=f"This is a fault of impactopt: {type(answer).__name__}: {answer}")
-        if answer.track is None:
-            self.status.content = failure_message(answer)
-        else:
+        if answer.track is not None:
             self._show_plan(answer)
+        with self._request_lock:
+            if request == self.request:  # else a newer one is planned, and the status says so
+                self.status.content = failure_message(answer) if answer.track is None else ""
 
     def _show_plan(self, answer: Answer) -> None:
         """Draw this plan in place of the one before."""
@@ -150,7 +151,6 @@ class PlanPage(LivePage):
             self._drawing.show(answer.solution.problem, answer.track, answer.solution.plan.polygon)
             self._draw()
         self.text.content = plan_message(answer, self.first)
-        self.status.content = ""
 
     def _draw(self) -> None:
         with self._scene_lock, self._server.atomic():
@@ -167,7 +167,9 @@ def plan_message(answer: Answer, first: Solution) -> str:
         f"- {plan.hand_speed:.2f} m/s at contact",
     ]
     if duration > 0:
-        lines.append(f"- {plan.collision.peak_force:.0f} N at most, for {1e3 * duration:.1f} ms")
+        replay = solution.contact_replay  # the program's points may miss the peak by some per cent
+        peak = plan.collision.peak_force if replay is None else replay.peak
+        lines.append(f"- {peak:.0f} N at most, for {1e3 * duration:.1f} ms")
     for name, label, unit, factor in (
         ("zmp_margin_m", "ZMP margin", " mm", 1e3),
         ("torque_ratio", "torque", " % of its limit", 1e2),

@@ -81,7 +81,7 @@ class LatestRequest(Generic[Request, Outcome]):
 
 _RANGE = 4.0  # factor from a parameter's value in the problem to the ends of its slider
 _STEPS = 200  # of a slider
-_MARGIN = 0.06  # [m] end of the slider for the ZMP's margin, or more
+_MARGIN = 0.06  # [m] end of the slider for the margin of the soles' CoP, or more
 _PREFIXES = {"M": 1e6, "k": 1e3, "": 1.0}  # the page's number fields show five digits
 
 
@@ -128,8 +128,8 @@ def request_of(problem: ImpactProblem) -> PlanRequest:
 
 
 def slider_parameters(problem: ImpactProblem) -> tuple[SliderParameter, ...]:
-    """Parameters with sliders: mass of the target, stiffness of the contact, margin of the ZMP; those that
-    the problem has.
+    """Parameters with sliders: mass of the target, stiffness of the contact, margin of the centre of pressure
+    in each sole; those that the problem has.
     """
     found = []
     parts: tuple[tuple[str, str, Any, dict[str, float]], ...] = (
@@ -145,9 +145,9 @@ def slider_parameters(problem: ImpactProblem) -> tuple[SliderParameter, ...]:
                 value /= scale
                 found.append(_between(name, label, value, value / _RANGE, value * _RANGE, scale))
     if problem.coordinates.legs:
-        margin = 1e3 * problem.term(ContactWrenchCone).margin
+        margin = problem.term(ContactWrenchCone).margin
         found.append(
-            _between("margin", "margin of the ZMP [m]", margin / 1e3, 0.0, max(2e-3 * margin, _MARGIN))
+            _between("margin", "margin of the soles' CoP [m]", margin, 0.0, max(2 * margin, _MARGIN))
         )
     return tuple(found)
 

@@ -51,7 +51,7 @@ class Series:
                 "depth_m": blow.depth,
                 "driven_m": blow.driven,
                 "impulse_Ns": blow.solution.impulse,
-                "peak_force_N": blow.solution.plan.collision.peak_force,
+                "peak_force_N": blow.solution.collision.peak_force,
                 "hand_speed_m_s": blow.solution.plan.hand_speed,
                 "iterations": blow.solution.result.iterations,
                 "solve_seconds": blow.solution.solve_seconds,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.files.output import is_usable
 from impactopt.files.record import Record, plain
 from impactopt.files.toml import TOMLError, read_toml
 from impactopt.report.charts import chart, series_of
@@ -103,10 +104,7 @@ def _rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     """Rows of the table of values; None for one without values."""
     yield Row(
         "status",
-        tuple(
-            Cell(str(s.get("status", NOT_SET)), s.get("status") in ("solved", "acceptable"))
-            for s in summaries
-        ),
+        tuple(Cell(str(s.get("status", NOT_SET)), is_usable(s.get("status"))) for s in summaries),
     )
     replays = [s.get("replayed") or s.get("simulated") or {} for s in summaries]
     yield from contact_rows(summaries)

@@ -17,10 +17,8 @@ from rich.table import Table
 
 from impactopt.errors import counted, printable
 from impactopt.report.result_rows import (
-    PHASES,
     Row,
     collision_rows,
-    number_row,
     replay_columns,
     result_columns,
     result_rows,
@@ -31,7 +29,6 @@ from impactopt.solvers.program import IterationRecord, without_violations
 if TYPE_CHECKING:
     from impactopt.report.comparison import Comparison
 
-PHASES_OF_STRIKE = ("contact", "collision")
 PIPE_WIDTH = 500  # columns of output that does not go to a terminal
 MIN_INTERVAL = 1.0  # [s] between lines about iterations where a line cannot be rewritten
 
@@ -169,12 +166,7 @@ def verdict_table(verdict: Mapping[str, Any]) -> Table:
 
 def strike_table(summary: Mapping[str, Any]) -> Table:
     """Table of a planned strike; `summary` as in a :class:`impactopt.StrikeSolution`."""
-    table = _table(summary, {"planned": summary}, PHASES_OF_STRIKE)
-    margin = [summary.get("capture_margin_m")]
-    row = number_row("capture point's margin after contact [mm]", margin, 1, scale=1e3, least=-1e-6)
-    if row is not None:
-        _add(table, row)
-    return table
+    return _table(summary, {"planned": summary})
 
 
 def collision_table(found: Mapping[str, Any]) -> Table:
@@ -263,12 +255,10 @@ def multistart_table(starts: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def _table(
-    summary: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]], phases: Sequence[str] = PHASES
-) -> Table:
+def _table(summary: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]]) -> Table:
     """Table titled with the problem's name, with the rows of `result_rows`."""
     table = _empty(str(summary.get("problem", {}).get("name", "result")), "", *columns)
-    for row in result_rows(columns, phases):
+    for row in result_rows(columns):
         _add(table, row)
     return table
 

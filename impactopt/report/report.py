@@ -7,7 +7,7 @@ from html import escape
 from typing import Any
 
 from impactopt.errors import counted
-from impactopt.files.output import record_of
+from impactopt.files.output import is_usable, record_of
 from impactopt.files.record import Record
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
@@ -38,10 +38,12 @@ def report_of(record: Record, problem: ImpactProblem | None = None) -> Page:
         arrays |= solids
     title = str(record.summary.get("problem", {}).get("name", "")) or "result"
     known = record.summary.get("problem", {})
+    about = [str(known[key]) for key in ("robot", "striker") if known.get(key)]
+    about += ["the impact alone, without a motion"] if "strike_posture" in record.arrays else []
     html = report_html(
         title=title,
         heading=title,
-        about=" · ".join(str(known[key]) for key in ("robot", "striker") if known.get(key)),
+        about=" · ".join(about),
         parts=_parts(record, animated=bool(header)),
         header={**header, "charts": charts},
         arrays=arrays,
@@ -97,7 +99,8 @@ def _cards(s: Mapping[str, Any]) -> str:
 
     seconds = f"{s.get('solve_seconds') or 0.0:.1f}{NARROW}s"
     spent = f"{s.get('solver', '')}, {counted(s.get('iterations', 0), 'iteration')}, {seconds}"
-    card(str(s.get("status", "?")), spent, "good" if s.get("status") == "solved" else "bad")
+    status = s.get("status")
+    card(str(status or "?"), spent, "good" if status == "solved" else "" if is_usable(status) else "bad")
     if s.get("impulse_Ns") is not None:
         error = replay.get("impulse_error_pct")
         beside = "" if error is None else f", {round(error, 1) + 0.0:+.1f}{NARROW}% when replayed"
@@ -108,9 +111,9 @@ def _cards(s: Mapping[str, Any]) -> str:
         card(f"{s['hand_speed_m_s']:.2f} m/s", "speed of the striking point at contact")
     margins = s.get("sole_cop_margin_mm") or {}
     if margins:
-        least = min(min(phases.values()) for phases in margins.values())
-        required = min((s.get("sole_cop_margin_asked_mm") or {}).values(), default=None)
-        beside = "" if required is None else f", {required:g}{NARROW}mm required at nodes"
+        least, phase = min((kept, phase) for phases in margins.values() for phase, kept in phases.items())
+        required = (s.get("sole_cop_margin_asked_mm") or {}).get(phase)  # each phase has its own
+        beside = "" if required is None else f", in {phase}; {required:g}{NARROW}mm required at nodes"
         kind = "bad" if shortfalls(s) else ""
         card(f"{least:.0f} mm", f"least planned margin of a sole's centre of pressure{beside}", kind)
     standing = s.get("replayed", {}).get("standing")

@@ -13,7 +13,7 @@ from impactopt.files.record import replay_name
 from impactopt.robots.loads import SHARE, margin_between_nodes
 from impactopt.solvers.program import MINOR
 
-PHASES = ("swing", "collision", "follow", "missed")
+PHASES = ("swing", "contact", "collision", "follow", "missed")  # contact: the state of a strike
 MAX_SLIP = 5.0  # [mm] on free soles: a plan within its friction slips less
 TOLERANCE = 0.1  # [mm, N] of sole margins: a sole that tips on its edge may seem to be slightly outside
 Columns = Mapping[str, Mapping[str, Any]]
@@ -52,15 +52,17 @@ def replay_columns(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Col
     return _present({"planned": summary, name: _by_phase(report)})
 
 
-def result_rows(columns: Columns, phases: Sequence[str] = PHASES) -> list[Row]:
+def result_rows(columns: Columns) -> list[Row]:
     """Rows with a value in at least one column; the first column is the plan's."""
-    return [row for row in _rows(list(columns.values()), phases) if row is not None]
+    return [row for row in _rows(list(columns.values())) if row is not None]
 
 
-def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterator[Row | None]:
+def _rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     yield from contact_rows(sources)
-    yield from phase_rows(sources, phases)
+    yield from phase_rows(sources, PHASES)
     yield from _sole_rows(sources)
+    captured = [source.get("capture_margin_m") for source in sources]
+    yield number_row("capture point's margin after contact [mm]", captured, 1, scale=1e3, least=-1e-6)
     for label, key, joint, digits, most in (
         ("gear load / torque limit", "gear_ratio", "gear_joint", 2, np.inf),
         ("motor load / torque-speed line", "motor_ratio", "motor_joint", 2, 1.0),

@@ -28,7 +28,8 @@ def bodies_page(robot: Robot) -> Page:
     """Page of a robot's bodies in `USUAL_POSTURE`, else in its first posture, or else in the neutral."""
     names = sorted(robot.postures, key=lambda name: name != USUAL_POSTURE)
     posture = robot.posture(names[0]) if names else pin.neutral(robot.model)
-    return _page(robot, posture, names[0] if names else "neutral", robot.name)
+    floor = 0.0 if robot.soles else None  # without soles it has ground only where a problem gives one
+    return _page(robot, posture, names[0] if names else "neutral", robot.name, floor=floor)
 
 
 def bodies_page_of_problem(problem: ImpactProblem) -> Page:
@@ -42,6 +43,7 @@ def bodies_page_of_problem(problem: ImpactProblem) -> Page:
         title,
         world=problem.world,
         normal=problem.normal,
+        point=problem.point,
         floor=problem.ground_height,
     )
 
@@ -54,7 +56,8 @@ def _page(
     *,
     world: tuple[WorldBody, ...] = (),
     normal: Array | None = None,
-    floor: float | None = 0.0,
+    point: Array | None = None,
+    floor: float | None,
 ) -> Page:
     links, arrays = bodies_of(robot), dict[str, Any]()
     header = {
@@ -64,7 +67,7 @@ def _page(
         "tracks": [pack_track("track0", _still(robot, q, f"posture: {posture}"), arrays)],
         "soles": [],
         "normal": np.array([1.0, 0.0, 0.0]) if normal is None else normal,
-        "point": arrays["track0_hand"][0],
+        "point": arrays["track0_hand"][0] if point is None else point,  # in view, and seen from its side
         "side": middle(arrays["track0_places"]),
         "weight": 1.0,
         "around": 0.0,

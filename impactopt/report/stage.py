@@ -46,6 +46,8 @@ def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Ar
         "far": FAR,
         "floor": problem.ground_height,
         "legged": len(record.arrays["polygon"]) > 0,
+        "both": problem.second is not None,  # the force is drawn at the first hand
+        "stances": bool(record.summary.get("stances")),
     }
     return header, arrays
 

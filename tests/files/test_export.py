@@ -799,8 +799,9 @@ def test_the_command_writes_and_lists_files(
     assert done.exit_code == 2 and done.stderr.count("error:") == 1 and "'a'" in done.stderr
 
 
-def test_a_problem_file_that_is_not_the_plans_is_told(planned: Planned, tmp_path: Path) -> None:
-    """The target and the law in the files are then of another problem than the motion."""
+@pytest.fixture
+def own_and_other(planned: Planned, tmp_path: Path) -> tuple[Path, list[tuple[Path, bool]]]:
+    """A saved plan; its problem's file and another one, and whether that is told."""
     path = problem_file("arm_planar")
     text = path.read_text(encoding="utf-8")
     own = {**planned.record.summary["problem"], "hash": load_problem(path).hash}
@@ -810,12 +811,41 @@ def test_a_problem_file_that_is_not_the_plans_is_told(planned: Planned, tmp_path
     save_record(record, tmp_path / "arm")
     other = tmp_path / "other.toml"
     other.write_text(text.replace("resistance_N = 600.0", "resistance_N = 500.0"), encoding="utf-8")
-    for file, told in ((path, False), (other, True)):
+    return tmp_path / "arm", [(path, False), (other, True)]
+
+
+def test_a_problem_file_that_is_not_the_plans_is_told(
+    own_and_other: tuple[Path, list[tuple[Path, bool]]], tmp_path: Path
+) -> None:
+    """The target and the law in the files are then of another problem than the motion."""
+    plan, files = own_and_other
+    for file, told in files:
         out = ["--to", "csv", "--out", str(tmp_path / "csv"), "--problem", str(file)]
-        done = runner.invoke(app, ["export", str(tmp_path / "arm"), *out])
+        done = runner.invoke(app, ["export", str(plan), *out])
         assert done.exit_code == 0, done.output
         assert ("is not the problem of this plan" in done.stdout) == told
-        done = runner.invoke(app, ["export", str(tmp_path / "arm"), *out, "--json"])
+        done = runner.invoke(app, ["export", str(plan), *out, "--json"])
+        assert ("caution" in json.loads(done.stdout)) == told
+
+
+@pytest.mark.slow
+def test_pictures_and_replays_under_another_problem_tell_it(
+    own_and_other: tuple[Path, list[tuple[Path, bool]]], tmp_path: Path
+) -> None:
+    plan, files = own_and_other
+    page = tmp_path / "page.html"
+    for file, told in files:
+        for command in (
+            ["show", "--out", str(page)],
+            ["show", "--sheet", str(tmp_path / "sheet.png")],
+            ["validate", "-q"],
+        ):
+            given = [*command, str(plan), "--problem", str(file)]
+            done = runner.invoke(app, given, env={"COLUMNS": "200"})
+            assert done.exit_code == 0, done.output
+            assert ("is not the problem of this plan" in done.stdout) == told
+        assert ("is not the problem of this plan" in page.read_text(encoding="utf-8")) == told
+        done = runner.invoke(app, ["validate", str(plan), "--problem", str(file), "--json"])
         assert ("caution" in json.loads(done.stdout)) == told
 
 

@@ -208,6 +208,17 @@ def test_the_animation_draws_the_world_where_the_replay_has_it(still: Replay) ->
     assert _Drawing(gone).look(0).world == []
 
 
+def test_the_hand_stays_in_the_picture(still: Replay) -> None:
+    """That of a robot that falls left it: it is beyond the last joint."""
+    drawing = _Drawing(still)
+    scene = drawing.look(0)
+    far = dataclasses.replace(scene, hand=scene.hand + np.array([1.0, 0.0, 0.5]))
+    drawing.set_up([scene, far])
+    for axes, view in zip(drawing.panels[:2], drawing.views, strict=False):
+        for at, (low, high) in zip(view @ far.hand, (axes.get_xlim(), axes.get_ylim()), strict=True):
+            assert low < at < high
+
+
 @pytest.mark.slow
 def test_the_animation_is_a_gif_with_every_instant(still: Replay, tmp_path: Path) -> None:
     sim = still.simulation

@@ -45,6 +45,9 @@ def test_at_first_the_hand_is_at_the_target_and_hits(look: CollisionPage) -> Non
     assert hit is not None
     assert hit.impulse == model.collide(q, v, holding_torque(p.robot, q, v, stance=p.stance)).impulse
     assert f"**{hit.impulse:.3g} N s**" in look.text.content
+    # also beyond the limit, where `collide` refuses it
+    share = np.abs(v[-p.robot.n :] / p.robot.velocity_limit).max()
+    assert f"- joint speed {100 * share:.0f} % of the limit" in look.text.content
 
 
 def test_a_slider_of_posture_or_speed_makes_another_collision(look: CollisionPage) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import signal
 import subprocess
 import sys
 import types
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.parse import quote, urlsplit
@@ -34,6 +35,7 @@ from impactopt import (
     Status,
     load_problem,
     load_record,
+    load_solution,
     moved_solution,
     solve,
 )
@@ -140,6 +142,33 @@ def test_a_fault_of_ours_is_told_and_leaves_the_old_plan(
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
+def test_controls_that_move_while_a_plan_is_drawn_leave_the_page_planning(
+    arm: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plan that is drawn is then not of the controls, though there was no newer request before."""
+    told, pages = list[str](), list[PlanPage]()
+
+    class Answering(Replanning):
+        def __call__(self, request: PlanRequest, stale: Callable[[], bool]) -> Answer:
+            told.extend(page.status.content for page in pages)
+            return super().__call__(request_of(arm.problem), stale)
+
+    monkeypatch.setattr(look_module, "Replanning", Answering)
+    with PlanPage(arm) as look:
+        pages.append(look)
+        assert look.status.order < look.text.order, "it is above the numbers that it is about"
+
+        def drawn(answer: Answer, first: Solution) -> str:
+            look.sliders["stiffness"].value *= 1.01 if len(told) == 1 else 1.0
+            look.changed()
+            return plan_message(answer, first)
+
+        monkeypatch.setattr(look_module, "plan_message", drawn)
+        look.sliders["mass"].value *= 1.1
+        assert look.wait(LONG)
+        assert told == ["Planning ...", "Planning ..."] and look.status.content == ""
+
+
 def test_a_stale_request_stops_the_solver(arm: Solution) -> None:
     replanning = Replanning(arm)
     request = request_of(arm.problem)
@@ -184,6 +213,8 @@ def test_a_legged_robot_has_a_margin_and_a_wall_no_mass(arm: Solution) -> None:
     assert [n.name for n in slider_parameters(arm.problem)] == ["mass", "stiffness"]
     biped = biped_problem()
     assert [n.name for n in slider_parameters(biped)] == ["mass", "stiffness", "margin"]
+    # `moved(margin=...)` is that of each sole; the page's ZMP margins are of their hull
+    assert slider_parameters(biped)[-1].label == "margin of the soles' CoP [m]"
     wall = dataclasses.replace(biped, target=RigidWall())
     assert [n.name for n in slider_parameters(wall)] == ["stiffness", "margin"]
     for number in slider_parameters(biped):
@@ -208,6 +239,18 @@ def test_an_acceptable_plan_says_what_it_lacks(arm: Solution) -> None:
     text = plan_message(Answer(solution=plan), arm)
     assert why in text and "All constraints are met." not in text
     assert "All constraints are met." in plan_message(Answer(solution=arm), arm)
+
+
+@pytest.mark.slow
+def test_the_largest_force_on_a_page_is_that_of_full_dynamics() -> None:
+    """The points of this nail's contact miss its peak by 6 %."""
+    nail = solve(load_problem("arm7"))
+    mass = 1.1 * nail.problem.target.parameters["mass"]
+    for plan in (nail, moved_solution(nail, mass=mass)):
+        peak = plan.validate().peak_force
+        found = re.search(r"(\d+) N at most", plan_message(Answer(solution=plan), nail))
+        assert found is not None and float(found[1]) == pytest.approx(peak, rel=5e-3)
+        assert plan.plan.collision.peak_force < 0.97 * peak
 
 
 def test_between_instants_joints_are_where_the_robot_would_be(arm: Solution) -> None:
@@ -246,6 +289,21 @@ def test_a_saved_result_is_a_start_again(arm: Solution, saved: Path) -> None:
     assert again.trajectory.q == pytest.approx(arm.trajectory.q, abs=1e-12)
     mass = 1.1 * arm.problem.target.mass
     assert moved_solution(again, mass=mass).impulse == pytest.approx(arm.moved(mass=mass).impulse, rel=1e-9)
+
+
+def test_a_result_under_another_problem_is_solved_for_that(
+    arm: Solution, saved: Path, tmp_path: Path
+) -> None:
+    """The saved motion meets looser limits, too, but is no optimum within them."""
+    own, other = tmp_path / "own.toml", tmp_path / "other.toml"
+    own.write_text(FILE.read_text(encoding="utf-8"), encoding="utf-8")
+    looser = "[terms.velocity_limit]\nfraction = 1.0\n"
+    other.write_text(f"{FILE.read_text(encoding='utf-8')}\n{looser}", encoding="utf-8")
+    worth = arm.objectives["target energy"]
+    assert load_solution(saved, problem_file=own).objectives["target energy"] == worth
+    again = load_solution(saved, problem_file=other)
+    assert again.status.usable
+    assert again.objectives["target energy"] > 1.001 * worth
 
 
 @pytest.mark.parametrize("without", ["program_statement", "solver_x"])

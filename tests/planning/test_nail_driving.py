@@ -13,11 +13,21 @@ import pytest
 from support.small_robots import arm, striking_point
 from typer.testing import CliRunner
 
-from impactopt import FixedBase, FreeMass, ImpactProblem, InputError, KelvinVoigt, Nail, Status
+from impactopt import (
+    FixedBase,
+    FreeMass,
+    ImpactProblem,
+    InputError,
+    KelvinVoigt,
+    Nail,
+    Status,
+    load_problem,
+    solve,
+)
 from impactopt.cli.app import app
 from impactopt.files.problem_file import ProblemFile
 from impactopt.planning import nail_driving as blows
-from impactopt.planning.nail_driving import drive_nail
+from impactopt.planning.nail_driving import Blow, Series, drive_nail
 
 NAIL = Nail(mass=0.05, resistance=1000.0, hardening=2e4, depth=0.01)
 WORK = 10.0  # [J] of each made-up blow
@@ -66,6 +76,7 @@ class Solver:
             problem=problem,
             status=self.fails if k in self.fails_at else Status.SOLVED,
             plan=SimpleNamespace(collision=collision, hand_speed=3.0),
+            collision=collision,
             result=SimpleNamespace(x=np.full(4, float(k)), iterations=7, message="no way"),
             impulse=5.0,
             solve_seconds=0.5,
@@ -138,6 +149,14 @@ def test_a_blow_from_the_plan_before_has_one_start(monkeypatch: pytest.MonkeyPat
 def test_a_nail_that_is_in_on_the_last_step_is_in(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blows, "solve", Solver(drives=lambda nail: 5e-5))
     assert drive_nail(nailing(), depth=0.01 + 4e-5).done
+
+
+def test_a_blow_has_the_peak_force_of_its_solutions_summary() -> None:
+    """That of the finer mesh, as of `impactopt solve`, not that of the program's points."""
+    solution = solve(load_problem("arm_planar"))
+    series = Series(blows=(Blow(solution=solution, depth=0.007),), reason="")
+    peak = series.describe()["blows"][0]["peak_force_N"]
+    assert peak == solution.summary()["peak_force_N"] != solution.plan.collision.peak_force
 
 
 def test_what_cannot_be_driven_is_refused(solver: Solver) -> None:

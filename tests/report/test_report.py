@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import re
 from html.parser import HTMLParser
@@ -11,12 +12,24 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from matplotlib.colors import to_rgb
 from support.browser import DARK, WITHOUT_3D, Job, Visit, visit
 from support.fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_solution
 from support.small_robots import biped
 from typer.testing import CliRunner
 
-from impactopt import Board, ImpactProblem, InputError, KelvinVoigt, Obstacle, Solution, load_robot
+from impactopt import (
+    Board,
+    ImpactProblem,
+    InputError,
+    KelvinVoigt,
+    Obstacle,
+    Solution,
+    Status,
+    TargetBody,
+    load_problem,
+    load_robot,
+)
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.visuals import surroundings_of, visuals_of
 from impactopt.cli.app import app
@@ -24,9 +37,12 @@ from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
 from impactopt.files.record import Record
 from impactopt.report.animation import animation_of
+from impactopt.report.comparison import compare
 from impactopt.report.page import unpack
+from impactopt.report.pictures.sheet import sheet
+from impactopt.report.pictures.style import ORANGE
 from impactopt.report.report import report_of
-from impactopt.report.robot_page import bodies_page
+from impactopt.report.robot_page import bodies_page, bodies_page_of_problem
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
 
@@ -150,6 +166,66 @@ def test_the_command_writes_the_page_into_the_result(tmp_path: Path, record: Rec
     assert runner.invoke(app, ["show", str(tmp_path / "none")]).exit_code == 2
 
 
+def _cards(record: Record, **numbers: Any) -> list[tuple[str, str, str]]:
+    """Class, value and text of each card of a page without the motion; numbers : of its summary."""
+    html = report_of(Record(summary={**record.summary, **numbers}, problem="", arrays={})).html
+    return re.findall(r'<div class="card"><b class="(.*?)">(.*?)</b><span>(.*?)</span>', html)
+
+
+def test_a_page_and_a_comparison_take_the_same_status_for_bad(record: Record) -> None:
+    for status in Status:
+        kind = next(kind for kind, value, _ in _cards(record, status=status.value) if value == status.value)
+        both = {
+            n: Record(summary={**record.summary, "status": status.value}, problem="", arrays={}) for n in "ab"
+        }
+        row = next(row for row in compare(both).rows if row.label == "status")
+        assert (kind != "bad") == row.cells[0].good == status.usable
+
+
+def test_the_least_margin_of_a_sole_is_beside_what_its_own_phase_requires(record: Record) -> None:
+    margins = {"left": {"swing": 29.6, "collision": 46.0, "follow": 22.0}, "right": {"swing": 29.9}}
+    asked = {"swing": 30.0, "collision": 20.0, "follow": 30.0}
+    cards = _cards(record, sole_cop_margin_mm=margins, sole_cop_margin_asked_mm=asked)
+    ((kind, value, about),) = (card for card in cards if "centre of pressure" in card[2])
+    assert (kind, value) == ("", "22 mm") and "follow" in about
+    assert "30\u202fmm required" in about and "20\u202fmm" not in about
+
+
+def test_a_strikes_page_has_its_numbers_and_says_what_it_is(record: Record) -> None:
+    """It had the state at contact in no row, and looked like the page of a motion."""
+    numbers = {
+        "zmp_margin_m": {"contact": 0.0813, "collision": 0.0212},
+        "torque_ratio": {"contact": 0.83, "collision": 0.84},
+        "capture_margin_m": 0.0904,
+    }
+    summary = {k: v for k, v in record.summary.items() if k not in ("simulated", "replayed")} | numbers
+    strike = Record(summary=summary, problem="", arrays={"strike_posture": np.zeros(3)})
+    text = Reader(report_of(strike).html).text
+    assert "the impact alone" in text
+    for label, value in (
+        ("ZMP margin [mm], contact", "81.3"),
+        ("ZMP margin [mm], collision", "21.2"),
+        ("torque demand / limit, contact", "0.83"),
+        ("capture point's margin after contact [mm]", "90.4"),
+    ):
+        assert f"{label}{value}" in "".join(text.split("\n"))
+    assert "the impact alone" not in Reader(report_of(record).html).text
+
+
+@pytest.mark.slow
+def test_a_door_hides_the_robot_from_no_side_of_a_sheet() -> None:
+    """It covered the robot in the front view until it had moved away."""
+    orange, shown = np.array(to_rgb(ORANGE)), dict[float, list[bool]]()
+    for width in (0.18, 0.9):  # a box, a door
+        problem = still_problem(body=TargetBody(size=(width, 2 * width, 0.04)))
+        drawn = sheet(record_of(still_solution(problem=problem)), problem)
+        faces = [np.asarray(axes.collections[0].get_facecolor())[:, :3] for axes in drawn.axes[::7]]
+        # faces are shaded: their colours are along the target's
+        along = [colours / np.linalg.norm(colours, axis=1, keepdims=True) for colours in faces]
+        shown[width] = [bool((row @ orange / np.linalg.norm(orange) > 0.9999).any()) for row in along]
+    assert shown == {0.18: [True, True, True], 0.9: [False, True, True]}
+
+
 # ---- in a browser
 
 WIDE = "document.documentElement.scrollWidth <= innerWidth"
@@ -260,6 +336,29 @@ def test_the_animation_works(seen: list[dict[str, Any]], record: Record, solutio
     np.testing.assert_allclose(np.reshape(wide["place"], (-1, 4, 4)), places, atol=1e-5)
 
 
+@pytest.mark.slow
+def test_what_is_drawn_is_named_as_what_it_is(record: Record, solution: Solution, tmp_path: Path) -> None:
+    """One polygon is drawn in all phases of a motion with steps, one arrow for two hands."""
+    stances = [{"soles": ["left", "right"], "from_s": 0.0, "to_s": 1.0}]
+    stepping = dataclasses.replace(record, summary={**record.summary, "stances": stances})
+    two_hands = copy.copy(solution.problem)
+    object.__setattr__(two_hands, "second", "another hand")  # the biped has one
+    marks = "document.querySelector('.marks').innerText.split('\\n').map((text) => text.trim())"
+    usual = report_of(record, solution.problem).save(tmp_path / "usual.html")
+    other = report_of(stepping, two_hands).save(tmp_path / "other.html")
+    found = visit(Job(page=usual, scripts=(marks,)), Job(page=other, scripts=(marks,)))
+    for seen, names in zip(
+        found,
+        (
+            ["force on the target", "support polygon"],
+            ["force of both hands on the target", "support polygon at contact"],
+        ),
+        strict=True,
+    ):
+        assert seen.console == []
+        assert [text for text in seen.values[0] if "target" in text or "polygon" in text] == names
+
+
 def test_a_target_that_flies_off_fades(seen: list[dict[str, Any]]) -> None:
     assert seen[0]["seen"] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0]), "over the second half of its way"
 
@@ -343,6 +442,22 @@ def test_a_robots_bodies_are_drawn_over_it(shown: list[dict[str, Any]]) -> None:
     assert page["pointed"][0] == page["pointed"][1] and page["left"] is None
     (share, error), (bare, _) = page["drawn"], page["bare"]
     assert 0.02 < share < 0.9 and error == 0 and share > bare == 0.0
+
+
+@pytest.mark.parametrize(("name", "floor"), [("standin", 0.0), ("planar_arm", None), ("space_arm", None)])
+def test_a_robot_without_soles_is_shown_without_ground(name: str, floor: float | None) -> None:
+    """It has ground only in a problem with [ground]."""
+    numbers = re.search(r'id="numbers">(.*?)<', bodies_page(load_robot(name)).html)
+    assert numbers is not None
+    assert unpack(numbers.group(1))[0]["floor"] == floor
+
+
+def test_a_problems_bodies_are_seen_from_the_side_of_its_hit_point() -> None:
+    """They were seen from the side of the robot's first striker, which may be another one."""
+    problem = load_problem("kick")
+    numbers = re.search(r'id="numbers">(.*?)<', bodies_page_of_problem(problem).html)
+    assert numbers is not None
+    np.testing.assert_array_equal(unpack(numbers.group(1))[0]["point"], problem.point)
 
 
 def test_a_robots_page_says_which_bodies_may_touch() -> None:

@@ -125,6 +125,20 @@ def test_a_logarithmic_colour_leaves_out_what_has_no_logarithm() -> None:
     columns = {**grid_columns(), "energy_J": [0.0, -1.0, 1.0, 10.0, 5.0, 2.0]}
     drawn = picture(columns, kind="scatter", x=SPEED, y=MASS, colour="energy_J", log=["colour"])
     assert drawn.axes[0].collections[0].norm.vmin == 1.0 and drawn.axes[0].collections[0].norm.vmax == 10.0
+    # and the picture tells: of five rows with a result one has -1 J and one 0 J
+    assert drawn.get_supxlabel() == "3 of 5 rows"
+    drawn = picture(
+        columns, kind="heatmap", x=SPEED, y=MASS, colour=["impulse_Ns", "energy_J"], log=["colour"]
+    )
+    (told,) = (text.get_text() for text in drawn.legends[0].get_texts())
+    assert told == "no result: elbow would be beyond its limit; energy of 0 or less, which has no logarithm"
+
+
+def test_a_reason_that_differs_in_its_details_alone_is_told_once() -> None:
+    columns = grid_columns()
+    columns["reason"][3:5] = ["no motion; 3 mm off", "no motion; 5 mm off"]
+    drawn = picture(columns, kind="heatmap", x=SPEED, y=MASS, colour="impulse_Ns")
+    assert [text.get_text() for text in drawn.legends[0].get_texts()] == ["no result: no motion"]
 
 
 @pytest.mark.parametrize("table", ["against", "contour", "labels"])

@@ -42,8 +42,11 @@ const VIEWS = { "3/4": [-1.95, 0.2], side: [-Math.PI / 2, 0.05], front: [-0.15, 
 
 // what is drawn or not, as the reader likes: name, text, on which pages there is any, and whether it is drawn at first
 const MARKS = [
-  ["force", "force on the target", (h) => !h.hulls], ["com", "centre of mass", (h) => h.legged], ["zmp", "zero-moment point", (h) => h.legged],
-  ["ground", "force of the ground", (h) => h.legged], ["polygon", "support polygon", (h) => h.legged], ["paths", "paths", (h) => !h.hulls],
+  ["force", "force on the target", (h) => !h.hulls && !h.both],
+  ["force", "force of both hands on the target", (h) => h.both],
+  ["com", "centre of mass", (h) => h.legged], ["zmp", "zero-moment point", (h) => h.legged],
+  ["ground", "force of the ground", (h) => h.legged], ["polygon", "support polygon", (h) => h.legged && !h.stances],
+  ["polygon", "support polygon at contact", (h) => h.stances], ["paths", "paths", (h) => !h.hulls],
   ["obstacles", "obstacles", (h) => h.world.some((part) => part.kind === "obstacle")],
   ["meshes", "what the robot looks like", (h) => h.hulls], ["hulls", "hulls", (h) => h.hulls],
 ];

@@ -126,7 +126,7 @@ class _Drawing:
 
     def set_up(self, scenes: list[_Instant]) -> None:
         """Makes panels that contain all scenes; the first two have the same scale."""
-        body = np.concatenate([s.sticks.reshape(-1, 3) for s in scenes])
+        body = np.concatenate([part for s in scenes for part in (s.sticks.reshape(-1, 3), s.hand[None])])
         near = [vertices for s in scenes for vertices in s.near]
         low, high = _bounds(np.concatenate([body, *near, *scenes[0].soles]), 0.08)
         floor = self.done.planned.problem.ground_height

@@ -49,7 +49,7 @@ def comparison_picture(records: Mapping[str, Record]) -> Picture:
             ax.set_xlim(-AROUND * longest, (1 + AROUND) * longest)
         ax.set(xlabel=f"time since contact [{'ms' if near else 's'}]", title=label)
         if limit != 0.0:
-            ax.set_ylim(bottom=0.0)
+            ax.set_ylim(bottom=min(0.0, ax.dataLim.y0))
     # every result has torques, the last panel
     handles, labels = axes[-1].get_legend_handles_labels()
     figure.legend(

@@ -43,7 +43,7 @@ def draw_force(place: FigureBase | Axes, record: Record) -> None:
         value = np.concatenate([[0.0, 0.0], value[keep], [np.interp(last, time, value)]])
         axes.plot(shown, value, color=SIMULATED, label=label)
     axes.set(xlabel="time since contact [ms]", ylabel="force on the target [N]")
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))  # below zero if the plan is no solution
     if isinstance(place, Axes):
         place.legend(title="impulse")
         return

@@ -36,8 +36,7 @@ def iterations(figure: FigureBase, record: Record) -> None:
     ):
         values = np.maximum(a[f"history_{key}"], MIN_VALUE)
         bottom.semilogy(count, values, style, color=colour, label=label)
-    seconds = float(a["history_seconds"][-1])
-    bottom.set(xlabel=f"iterations [-], {count[-1]} in {seconds:.1f} s", ylabel="residuals [-]")
+    bottom.set(xlabel="iterations [-]", ylabel="residuals [-]")
     figure.legend(loc="outside lower center", ncols=2)
 
 

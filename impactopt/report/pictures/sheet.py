@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from impactopt.bodies.solids import Solid, simplified
-from impactopt.bodies.visuals import Part, surroundings_of
+from impactopt.bodies.visuals import LARGE, Part, surroundings_of
 from impactopt.files.record import Record
 from impactopt.problem.motion_style import joints_to
 from impactopt.problem.problem import ImpactProblem
@@ -41,7 +41,9 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
     """
     track = tracks_of(record, problem)[0]
     chosen = _chosen(track)
+    points = np.array([problem.point, *([] if problem.second is None else [problem.second.point])])
     solids, world = _solids(problem), [p for p in surroundings_of(problem.world) if not _hides(p)]
+    beside = [p for p in world if not _covers(p)]
     robots = [_joined([_placed(track, k, solid) for solid in solids]) for k in chosen]
     around = [_around(track, k, world, problem.normal) for k in chosen]
     # a stray vertex of a mesh may lie anywhere
@@ -56,10 +58,11 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
     axes = figure.subplots(len(VIEWS), len(chosen), squeeze=False, gridspec_kw={"height_ratios": heights})
     for column, k in enumerate(chosen):
         scene = _joined([robots[column], *around[column]])
+        uncovered = _joined([robots[column], *_around(track, k, beside, problem.normal)])
         for row, (name, view) in enumerate(VIEWS):
             ax = axes[row, column]
-            _draw(ax, *scene, view)
-            ax.plot(*(np.asarray(problem.point) @ view[:2].T), "o", color=VERMILION, markersize=2, zorder=5)
+            _draw(ax, *(uncovered if name == "front" else scene), view)
+            ax.plot(*(points @ view[:2].T).T, "o", color=VERMILION, markersize=2, zorder=5)
             (left, right), (low, high) = (np.sort(ends @ direction) for direction in view[:2])
             ax.set(xlim=(left, right), ylim=(low, high), aspect="equal")
             ax.axis("off")
@@ -86,6 +89,11 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
 def _hides(part: Part) -> bool:
     """True if a body would hide the robot, as a wall does."""
     return part.clear and part.kind != "obstacle"
+
+
+def _covers(part: Part) -> bool:
+    """True if a target would cover the robot from the front, as a door does."""
+    return part.kind == "target" and float(np.ptp(part.solid.vertices, axis=0)[1:].min()) > LARGE
 
 
 def _around(track: Track, k: int, world: list[Part], normal: Array) -> list[Shown]:

@@ -111,11 +111,14 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
     shown = section.colour or ["impulse_Ns"]
     figure = Picture(PAGE, 2.9 if len(shown) < 3 else 2.4)
     panels = figure.subplots(1, len(shown), sharex=True, sharey=True, squeeze=False)[0]
+    grey = [f"no result: {data.note()}"] if data.reasons else []
     for axes, name in zip(panels, shown, strict=True):
         table = np.full((len(up), len(across)), np.nan)
         table[j, i] = data.results(name)
         table[~np.isfinite(table)] = np.nan
         axes.set_facecolor(NO_RESULT)
+        if "colour" in section.log and (table <= 0).any():
+            grey.append(f"{data.label(name).partition(' [')[0]} of 0 or less, which has no logarithm")
         mesh = axes.pcolormesh(
             _edges(across, "x" in section.log), _edges(up, "y" in section.log),
             np.ma.masked_invalid(table), cmap=SCALE, rasterized=True,
@@ -131,8 +134,8 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
         _scales(axes, section)
     panels[0].set_ylabel(data.label(section.y[0]))
     handles: list[Any] = []
-    if data.reasons:
-        handles.append(Patch(facecolor=NO_RESULT, label=f"no result: {data.note()}"))
+    if grey:
+        handles.append(Patch(facecolor=NO_RESULT, label="; ".join(grey)))
     for dashes, (column, level) in zip(DASHES, section.contour.items(), strict=False):
         what, _, unit = data.label(column).partition(" [")
         label = f"{what} {level:g} {unit.rstrip(']')}".rstrip()
@@ -247,7 +250,7 @@ def _scatter(section: Section, data: SweepColumns) -> Picture:
     if numeric and colour is not None:
         scale, least = (LogNorm, 0.0) if "colour" in section.log else (Normalize, -np.inf)
         levels = data.numbers(colour)[drawn]
-        levels = levels[levels > least]
+        drawn, levels = drawn[levels > least], levels[levels > least]  # others have no colour
         norm = scale(levels.min(), levels.max()) if len(levels) else scale(0.1, 1.0)
     groups, names = combined(section.colour[:1] if not numeric else [], data)
     marks: Any = None

@@ -29,7 +29,8 @@ class SweepColumns:
         self.section, self._columns = section, columns
         self._units = {name: unit_of(name) for name in columns} if units is None else units
         reasons = columns.get("reason", ())
-        self.reasons = Counter(str(r) for r in reasons if r)
+        # without what follows, which is each case's own
+        self.reasons = Counter(str(r).partition(";")[0] for r in reasons if r)
         self.good = np.array([not r for r in reasons], dtype=bool) if len(reasons) else None
 
     def values(self, name: str) -> NDArray[Any]:
@@ -68,7 +69,7 @@ class SweepColumns:
 
     def note(self) -> str:
         """The two most frequent reasons why cases have no result."""
-        return "; ".join(reason.partition(";")[0] for reason, _ in self.reasons.most_common(2))
+        return "; ".join(reason for reason, _ in self.reasons.most_common(2))
 
 
 def _label(name: str, unit: str) -> str:

@@ -28,6 +28,7 @@ from impactopt.files.record import Record
 from impactopt.kinematics.support import zmp
 from impactopt.report.charts import charts_of
 from impactopt.report.pictures import PICTURES, hierarchy, overview
+from impactopt.report.pictures.compare import comparison_picture
 from impactopt.report.pictures.ellipsoid import effective_masses
 from impactopt.report.pictures.style import DPI, PAGE, Picture
 from impactopt.simulation.reference.poses import inverse_mass, poses_of
@@ -146,6 +147,17 @@ def test_the_force_is_the_plans_and_the_simulations(punch_record: Record) -> Non
     assert impulse == pytest.approx(punch_record.summary["simulated"]["impulse_Ns"], rel=1e-3)
 
 
+def test_a_pull_of_a_plan_that_is_no_solution_is_in_the_pictures(punch_record: Record) -> None:
+    force = punch_record.arrays["collision_force"].copy()
+    force[1] = -240.0
+    pulls = dataclasses.replace(punch_record, arrays={**punch_record.arrays, "collision_force": force})
+    for picture in (PICTURES["force"](pulls), comparison_picture({"one": pulls, "other": punch_record})):
+        assert picture is not None
+        assert picture.axes[0].get_ylim()[0] <= -240.0
+    usual = PICTURES["force"](punch_record)
+    assert usual is not None and usual.axes[0].get_ylim()[0] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_the_zero_moment_point_is_the_plans_with_time_as_colour(punch_record: Record) -> None:
     a, picture = punch_record.arrays, PICTURES["zmp"](punch_record)
     assert picture is not None
@@ -240,6 +252,8 @@ def test_the_solvers_way_is_its_history(punch_record: Record) -> None:
     np.testing.assert_array_equal(gain.get_ydata(), -a["history_objective"])
     low, high = picture.axes[0].get_ylim()
     assert low <= -a["history_objective"][-1] <= high
+    # the history has only the time in the iterations, less than `solve_seconds` on the page and in the table
+    assert picture.axes[1].get_xlabel() == "iterations [-]"
 
 
 def test_the_torque_map_is_the_demand_over_the_limit(arm_record: Record) -> None:

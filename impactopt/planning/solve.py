@@ -137,7 +137,8 @@ def solve(
     if problem.floats and isinstance(start, str) and start == "strike":
         raise InputError(f"robot {problem.robot.name!r} floats freely, and has no strike: start from 'reach'")
     one = partial(_planned, seed, refine)
-    return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
+    best = best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
+    return with_soles_kept(best) if refine else best
 
 
 def _planned(
@@ -190,7 +191,7 @@ def _planned(
     again = margins if gains and refined else None
     outcome = BetweenNodes(budget, again).checked(outcome)
     usable = outcome.usable
-    solution = solution_of(
+    return solution_of(
         outcome,
         solver=budget.solver,
         seconds=(built - began, solved - built),
@@ -200,7 +201,6 @@ def _planned(
         window=window_caution(t, outcome.result) if usable else "",
         contact_error=outcome.at.contact_error if usable else None,
     )
-    return with_soles_kept(solution) if refined else solution
 
 
 def _program(

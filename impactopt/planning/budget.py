@@ -233,7 +233,7 @@ def rank_of(result: SolverResult) -> tuple[bool, bool, float]:
     """
     # Stopped solves count as feasible too, if they are.
     met = result.status.usable or result.max_violation <= VIOLATED
-    # A check, as of clearances, has its own message; the solver's own is of an iterate that is nearly optimal.
+    # A check, as of clearances, has a message of its own; the solver's is of an iterate near an optimum.
     acceptable = Status.ACCEPTABLE
     doubted = result.status is acceptable and not result.message.startswith(acceptable.message)
     return not met, doubted, result.objective if met else result.max_violation

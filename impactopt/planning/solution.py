@@ -325,14 +325,8 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        again = meets_again(self.problem, plan)
-        cautions = (
-            out.get("caution"),
-            again,
-            slide_caution(self.slide),
-            self.window,
-            overlapping(self.problem),
-        )
+        slides, again = slide_caution(self.slide), meets_again(self.problem, plan)
+        cautions = (out.get("caution"), again, slides, self.window, overlapping(self.problem))
         if caution := " ".join(filter(None, cautions)):
             out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *replayed])

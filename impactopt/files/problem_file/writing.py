@@ -164,7 +164,7 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
 
 
 def _actuators(robot: Robot) -> list[dict[str, Any]]:
-    """A section for each group of joints with equal actuators; passive joints, as of soft grips, have none."""
+    """A section for each group of joints with equal actuators, without passive joints, as of soft grips."""
     groups: dict[Actuator, list[str]] = {}
     for k in np.flatnonzero(~robot.passive):
         groups.setdefault(robot.actuators[k], []).append(robot.joint_names[k])

@@ -118,7 +118,10 @@ def _with_chosen_gains(problem: str, solution: Solution | StrikeSolution) -> str
     if not problem or not solution.gains:
         return problem
     data = read_toml(problem)
-    ranges = [k for k, each in enumerate(data["robot"]["gains"]) if isinstance(each["factor"], list)]
+    given = data.get("robot", {}).get("gains", ())
+    ranges = [k for k, each in enumerate(given) if isinstance(each["factor"], list)]
+    if not ranges:  # a text of the solution's own problem, whose robot has the chosen gains
+        return problem
     chosen = {f"robot.gains.{k}.factor": c.factor for k, c in zip(ranges, solution.gains, strict=True)}
     data = change_data(data, chosen)
     return write_toml(data, lambda place: comment_at(data, place))

@@ -24,6 +24,7 @@ from impactopt.files.output import record_of
 from impactopt.files.record import NUMBERS, SUMMARY, Record, load_record, read_json
 from impactopt.files.replay import problem_of, program_of_record, solution_of_record
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import HitRegion
 from impactopt.robots.loads import weight_of
 from impactopt.solvers.program import (
     bound_violations,
@@ -298,4 +299,7 @@ def motion_of_record(
         for striker, point in problem.contacts:
             pin.framesForwardKinematics(model, data, q[end])
             at = data.oMf[model.getFrameId(f"striker:{striker}")].translation
-            yield "reference: hit point", float(np.abs(at - point).max()), striker
+            offset = at - point
+            if problem.extra(HitRegion) is not None:  # the program's constraints are of the place in it
+                offset = offset @ problem.normal
+            yield "reference: hit point", float(np.abs(offset).max()), striker

@@ -227,11 +227,16 @@ class Budget:
         return result
 
 
-def rank_of(result: SolverResult) -> tuple[bool, float]:
-    """Sorting key, best first: feasible results by their objective, then the others by their violation."""
+def rank_of(result: SolverResult) -> tuple[bool, bool, float]:
+    """Sorting key, best first: feasible results by their objective, those that a check has made acceptable
+    after all others; then infeasible ones by their violation.
+    """
     # Stopped solves count as feasible too, if they are.
     met = result.status.usable or result.max_violation <= VIOLATED
-    return not met, result.objective if met else result.max_violation
+    # A check, as of clearances, has a message of its own; the solver's is of an iterate near an optimum.
+    acceptable = Status.ACCEPTABLE
+    doubted = result.status is acceptable and not result.message.startswith(acceptable.message)
+    return not met, doubted, result.objective if met else result.max_violation
 
 
 def one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:

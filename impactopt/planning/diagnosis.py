@@ -93,9 +93,9 @@ def with_reason(
     return replace(result, status=Status.INFEASIBLE, message=f"{why} {rest}")
 
 
-def with_soles_kept(solution: Solution) -> Solution:
-    """The solution itself if its soles keep at least half of each margin between nodes, too; else with the
-    status acceptable, and a message that names the margins.
+def with_limits_kept(solution: Solution) -> Solution:
+    """The solution itself if it keeps at least half of each sole's margin between nodes, too, and no joint is
+    beyond the robot's limits; else with the status acceptable, and a message that names them.
     """
     if solution.status is not Status.SOLVED:
         return solution
@@ -104,9 +104,28 @@ def with_soles_kept(solution: Solution) -> Solution:
             message = (
                 f"A sole keeps less than half of a margin between nodes: {'; '.join(short[:MAX_NAMED])}."
             )
-            result = replace(solution.result, status=Status.ACCEPTABLE, message=message)
-            return replace(solution, result=result)
+        elif beyond := _joints_beyond(solution):
+            message = f"Between nodes {beyond}; give more `intervals`, or more time."
+        else:
+            return solution
+        return replace(solution, result=replace(solution.result, status=Status.ACCEPTABLE, message=message))
     return solution
+
+
+def _joints_beyond(solution: Solution) -> str:
+    """Message with the joint that is farthest beyond the robot's limit of velocity or torque; "" if none."""
+    robot, plan = solution.problem.robot, solution.plan
+    worst, message = 1 + VIOLATED, ""
+    for t in (solution.trajectory, *([plan.missed_reference] if plan.abort is not None else [])):
+        for what, used in (
+            ("velocity", t.v[:, -robot.n :] / robot.velocity_limit),
+            ("torque", t.torque / robot.torque_limit),
+        ):
+            most = np.abs(used).max(axis=0)
+            k = int(most.argmax())
+            if most[k] > worst:
+                worst, message = most[k], f"{robot.joint_names[k]} has {most[k]:.3g} times its {what} limit"
+    return message
 
 
 def _too_stiff(t: ContactProgram) -> str:

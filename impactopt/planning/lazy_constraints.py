@@ -16,7 +16,7 @@ from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import Additions, Guess, Outcome, Program, program_for, start_of
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, ReferenceRange, Slide, Term
+from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, ReferenceRange, Slide, TargetSpeed, Term
 from impactopt.robots.loads import DriveLoads
 from impactopt.robots.robot import Robot
 from impactopt.simulation.result import FACE
@@ -33,6 +33,7 @@ REFERENCE_TOLERANCE = 1e-3  # [rad]
 SLIDE_TOLERANCE = 0.03  # of the limit
 FAR = 0.15  # [m] across the target's face: a longer slide gets a warning
 CONTACT_SAMPLES = 9  # instants of the contact at which the slide is measured
+_MET = 1e-3  # [m] beyond the target's plane after contact: a striking point meets the target again
 _AT_BOUND = 1e-3  # of a duration's bound: nearer ones are at it
 # A contact window gets a warning if twice its length gains this part of the objective, to first order.
 _COSTLY = 0.1
@@ -117,6 +118,30 @@ def slide_caution(length: float) -> str:
         f"The striking point slides {1e3 * length:.0f} mm across the target. "
         f"In replays the face ends {1e3 * FACE:.0f} mm from the hit point; [terms.slide] keeps it there."
     )
+
+
+def meets_again(problem: ImpactProblem, plan: Plan) -> str:
+    """Warning about a striking point that reaches the target again in the follow-through, such as a slow one;
+    "" without. A target that stays, or whose speed is bounded, has constraints for it.
+    """
+    if problem.target.stays or not problem.lasts or problem.extra(TargetSpeed) is not None:
+        return ""
+    reference = plan.coarse_reference
+    after = reference.phase == 2
+    time, postures = reference.time[after], reference.q[after]
+    plane = plan.travel(time)[:, None] * problem.normal + plan.aside(time)
+    for striker, point in problem.contacts:
+        offset = np.array([striking_point(problem.robot, striker, q) for q in postures]) - point - plane
+        beyond = offset @ problem.normal
+        over_face = np.linalg.norm(offset @ across(problem.normal).T, axis=1) < FACE
+        again = np.flatnonzero(over_face & (beyond > max(beyond[0], 0.0) + _MET))
+        if again.size:
+            return (
+                f"{striker} meets the target again {time[again[0]] - plan.contact_start:.2g} s after contact "
+                "began, which the planned impulse leaves out; [terms.target_speed] keeps it off, with "
+                "least_m_s = -inf and most_m_s = inf at any speed."
+            )
+    return ""
 
 
 def window_caution(t: Transcription, result: SolverResult) -> str:

@@ -22,7 +22,7 @@ from impactopt.planning.bounds import Cause
 from impactopt.planning.budget import VIOLATED, Budget, with_effort_of
 from impactopt.planning.causes import search
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solve_with_clearance
-from impactopt.planning.diagnosis import ended_with_violations, ipopt_retry, with_reason, with_soles_kept
+from impactopt.planning.diagnosis import ended_with_violations, ipopt_retry, with_limits_kept, with_reason
 from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
 from impactopt.planning.lazy_constraints import (
     LazyTerms,
@@ -138,7 +138,8 @@ def solve(
     if problem.floats and isinstance(start, str) and start == "strike":
         raise InputError(f"robot {problem.robot.name!r} floats freely, and has no strike: start from 'reach'")
     one = partial(_planned, seed, refine)
-    return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
+    best = best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
+    return with_limits_kept(best) if refine else best
 
 
 def _planned(
@@ -191,7 +192,7 @@ def _planned(
     again = margins if gains and refined else None
     outcome = BetweenNodes(budget, again).checked(outcome)
     usable = outcome.usable
-    solution = solution_of(
+    return solution_of(
         outcome,
         solver=budget.solver,
         seconds=(built - began, solved - built),
@@ -201,7 +202,6 @@ def _planned(
         window=window_caution(t, outcome.result) if usable else "",
         contact_error=outcome.at.contact_error if usable else None,
     )
-    return with_soles_kept(solution) if refined else solution
 
 
 def _program(

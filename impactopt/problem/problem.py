@@ -73,6 +73,7 @@ from impactopt.problem.stances import (
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
+    TERMS,
     GearLoad,
     HandOrientation,
     HitCone,
@@ -477,14 +478,20 @@ class ImpactProblem:
 
     @property
     def active_terms(self) -> tuple[Term, ...]:
-        """The problem's own terms and the default terms that add constraints, but not those switched off."""
-        given = {type(term) for term in self.terms}
+        """The problem's own terms and the default terms that add constraints, but not those switched off.
+
+        They are in the order of a problem file, which leaves out defaults, so that a plan that was read from
+        one has the same program.
+        """
+        own = [term for term in self.terms if term not in DEFAULT_TERMS]
+        own.sort(key=lambda term: TERMS.index(type(term)) if type(term) in TERMS else len(TERMS))
+        given = {type(term) for term in own}
         defaults = [
             t
             for t in DEFAULT_TERMS
             if type(t).add_constraints is not Term.add_constraints and type(t) not in given
         ]
-        return tuple(term for term in (*self.terms, *defaults) if term.active)
+        return tuple(term for term in (*own, *defaults) if term.active)
 
     @property
     def on_demand(self) -> tuple[Term, ...]:

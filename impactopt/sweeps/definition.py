@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -30,6 +31,7 @@ from impactopt.files.toml import (
     plain_value,
     text_with_control,
 )
+from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.collisions import Collisions, sweep_place
 from impactopt.sweeps.design import Axis, Column, Design, Draws, Span, column
 from impactopt.sweeps.sections import (
@@ -255,6 +257,22 @@ class Sweep:
         return self.settings.name or self.path.stem
 
     @cached_property
+    def built(self) -> ImpactProblem:
+        """The problem without varied keys; if only these complete it, that of the first case.
+
+        Raises
+        ------
+        InputError : neither can be built.
+        """
+        try:
+            return self.problem.build()
+        except InputError as error:
+            first = {key: values[0] for key, values in self.design.columns(0, 1).items()}
+            with contextlib.suppress(InputError):
+                return self.problem.changed(first).build()
+            raise error
+
+    @cached_property
     def files(self) -> Mapping[str, str]:
         """Hashes of the robots' files and the saved results that cases read, by key and path."""
         data = {"robot": self.problem.data.get("robot", {}), "at_contact": self.at_contact}
@@ -275,7 +293,7 @@ class Sweep:
         the files that they name.
         """
         # the built problem has what they do not name, such as the files of a preset, or of an MJCF's includes
-        data = [self.content, self.problem.data, self.problem.build().hash, self.files]
+        data = [self.content, self.problem.data, self.built.hash, self.files]
         # with all values, as another version of SciPy might draw other ones
         content = json.dumps(data, sort_keys=True).encode() + self.design.content()
         return hashlib.sha256(content).hexdigest()[:16]

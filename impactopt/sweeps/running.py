@@ -102,7 +102,7 @@ def sweep(
         raise InputError(f"{workers} workers; ask for at least 1")
     pyarrow()
     chosen = _read(source)
-    problem = chosen.problem.build()
+    problem = chosen.built
     store = Store(chosen, Path(out))
     try:
         with (

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.problem.objectives import Objective
+from impactopt.problem.objectives import OBJECTIVES, Objective
 from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
@@ -241,7 +241,11 @@ class ContactProgram(ABC):
                 self.constraints.measured(since, term.name, term.unit)
                 if not kind_of(term, Term).__module__.startswith("impactopt."):
                     self._check_own(type(term).__name__, since, before)
-        self.objectives = quantities(self, objectives)
+        # In the order of a problem file, as terms are.
+        known = sorted(
+            objectives, key=lambda o: OBJECTIVES.index(type(o)) if type(o) in OBJECTIVES else len(OBJECTIVES)
+        )
+        self.objectives = quantities(self, tuple(known))
         self._objective = assemble(self.layout, self.objectives, self._prices())
         # each round's set of clearance constraints is added to a copy of this builder
         self._without_clearance = self.builder

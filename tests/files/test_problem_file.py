@@ -336,10 +336,14 @@ def test_links_that_may_pass_through_each_other(tmp_path: Path) -> None:
         assert "[robot] disable_collisions" in message(write(tmp_path, wrong))
 
 
+RATE = "[terms.torque_rate] limit_N_m_s"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "parts"),
     [
-        ("limit_N_m_s = {arm_right_4_joint = 300}", "limit_N_m_s = 0", ["TorqueRate.limit", "> 0"]),
+        ("limit_N_m_s = {arm_right_4_joint = 300}", "limit_N_m_s = 0", [RATE, "> 0, or a table"]),
+        ("{arm_right_4_joint = 300}", "{arm_right_4_joint = 0}", [RATE, "> 0, or a table"]),
         ("margin_m = 0.03", "margin_m = -0.03", ["[terms.self_collision] margin_m", "-0.03"]),
         ("enabled = false", "enabled = 0", ["[terms.keep_out] enabled", "true or false"]),
         ("angle_rad = 0.15", "angle_rad = 1.6", ["[terms.hit_cone]", "between 0 and pi/2"]),

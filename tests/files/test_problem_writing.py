@@ -235,6 +235,15 @@ def test_terms_that_only_some_problems_have_come_back(nailing: ImpactProblem, na
         assert back(write_problem(problem)).terms == (term,)
 
 
+def test_motors_of_all_joints_but_a_soft_grip_come_back(nailing: ImpactProblem) -> None:
+    """The pattern * of a file is read before the grip, which no [[robot.actuators]] may name."""
+    grip = impactopt.SoftGrip(axis=[0, 1, 0], stiffness=200.0, damping=2.0, point=[0.0, 0.0, 0.05])
+    motor = impactopt.Actuator(power_limit=200.0)
+    robot = nailing.robot.with_actuators({"*": motor}).with_grip("hammer", grip)
+    problem = dataclasses.replace(nailing, robot=robot)
+    assert_same(back(write_problem(problem)), problem)
+
+
 def test_impacts_without_duration_and_one_foot_come_back() -> None:
     punch = load_problem("punch_one_foot")
     for changes in (

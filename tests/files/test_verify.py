@@ -14,7 +14,22 @@ import pytest
 from support.small_plans import arm_problem
 from typer.testing import CliRunner
 
-from impactopt import InputError, load_problem, load_record, load_solution
+import impactopt
+from impactopt import (
+    Effort,
+    FreeMass,
+    GearLoad,
+    HitRegion,
+    Impulse,
+    InputError,
+    Penetration,
+    SpringDamper,
+    TargetEnergy,
+    VelocityJump,
+    load_problem,
+    load_record,
+    load_solution,
+)
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import read_problem_file
@@ -221,6 +236,26 @@ def test_a_plan_of_the_cheapest_model_is_verified(tmp_path: Path) -> None:
     save_record(record_of(plan, problem=file.text, problem_path=file.path), tmp_path / "auto")
     assert plan.problem.collision == "sdc" and verified(tmp_path / "auto", code=0)["ok"]
     assert load_solution(tmp_path / "auto").problem.hash == plan.problem.hash
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"terms": (VelocityJump(limit=9.0), GearLoad())},  # in another order than in the file
+        {
+            "target": FreeMass(mass=2.0),
+            "law": SpringDamper(stiffness=1e5, damping=100.0),
+            "objectives": (Effort(weight=0.01), Penetration(weight=-10.0), TargetEnergy(), Impulse()),
+        },
+        {"terms": (HitRegion(radius=0.03),)},  # hit away from its middle
+    ],
+)
+def test_a_plan_that_is_saved_in_python_is_verified(changes: dict[str, Any], tmp_path: Path) -> None:
+    plan = impactopt.solve(dataclasses.replace(load_problem("arm_planar"), **changes))
+    found = verified(plan.save(tmp_path / "result"), code=0)
+    assert found["ok"], found["reason"]
+    assert load_solution(tmp_path / "result").result.x == pytest.approx(plan.result.x, abs=0.0)
 
 
 def test_the_motion_is_looked_at_by_pinocchio(record: Record) -> None:

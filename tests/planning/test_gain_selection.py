@@ -21,6 +21,7 @@ from impactopt import (
     Solution,
     load_problem,
     load_record,
+    load_solution,
     optimize_strike,
     scaled_gains,
     solve,
@@ -172,6 +173,15 @@ def test_a_file_leaves_gains_open_and_its_result_says_which(tmp_path: Path) -> N
     assert problem_of(kept, tmp_path, tmp_path / "open.toml").hash == again.hash
     verdict = verify(tmp_path)
     assert verdict.ok and verdict.kkt < 1e-5
+
+
+@pytest.mark.slow
+def test_a_solution_is_saved_with_the_gains_that_it_has_chosen(tmp_path: Path) -> None:
+    """Its own problem, whose text it is saved with, has no open gains any more."""
+    solution = solve(replace(load_problem("arm_planar"), gains=_open("*", between=(0.7, 1.3))), refine=False)
+    kept = load_solution(solution.save(tmp_path))
+    assert kept.gains == solution.gains != ()
+    np.testing.assert_allclose(kept.problem.robot.kp, solution.problem.robot.kp, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -57,6 +57,30 @@ def test_starts_that_end_otherwise_are_followed_by_another(
     assert "alike" not in best.result.message
 
 
+@pytest.mark.parametrize(
+    ("message", "kept"),
+    [
+        ("Bodies keep less than half of their clearance: arm and board 1 mm instead of 10.", 1),
+        (Status.ACCEPTABLE.message, 0),  # of the solver, for a motion that keeps all clearances
+    ],
+)
+def test_a_plan_that_loses_a_clearance_goes_after_one_that_keeps_all(
+    arm_plan: Planned, message: str, kept: int
+) -> None:
+    program, good = arm_plan.transcription, arm_plan.result
+    harder = replace(good, status=Status.ACCEPTABLE, message=message, objective=good.objective - 1.0)
+    ends = iter([harder, good])
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
+    guess = Guess(program=program, start=good.x)
+    best = best_of(
+        [(f"reach {k}", lambda: guess) for k in range(2)],
+        lambda guess: Outcome.of(guess.program, next(ends)),
+        budget,
+        2,
+    )
+    assert [attempt.kept for attempt in best.attempts] == [k == kept for k in range(2)]
+
+
 @pytest.mark.slow
 def test_a_limit_of_iterations_is_of_all_programs_of_each_start() -> None:
     """The seventh iterate of this arm lacks a clearance constraint, so that a second program is solved."""

@@ -12,7 +12,9 @@ import pytest
 
 from impactopt import Status
 from impactopt.planning.budget import Budget, rank_of
+from impactopt.planning.diagnosis import with_limits_kept
 from impactopt.planning.refinement import Additions, Guess, Outcome, refine
+from impactopt.planning.solution import Solution
 from impactopt.solvers.program import SolverResult
 
 FAILS = -1.0  # a guess from which there is no solution
@@ -94,6 +96,24 @@ def test_the_solution_of_the_last_round_is_checked_too(value: float, without: st
     assert found.result.x[0] == 2.0
     assert found.usable is (value == 2.0 or not without)
     assert found.usable or (found.result.message.endswith(without) and rank_of(found.result)[0])
+
+
+@pytest.mark.parametrize("limit", ["velocity", "torque"])
+def test_a_joint_beyond_its_limit_between_nodes_makes_a_plan_acceptable(
+    hammered: Solution, limit: str
+) -> None:
+    """As when the time is over before the mesh is refined. The elbow's limit is lowered below its use."""
+    robot, t = hammered.problem.robot, hammered.trajectory
+    used = {"velocity": t.v, "torque": t.torque}[limit][:, robot.joint_index("elbow")]
+    lower = np.array(getattr(robot, f"{limit}_limit"))
+    lower[robot.joint_index("elbow")] = np.abs(used).max() / 1.05
+    weaker = replace(
+        hammered, problem=replace(hammered.problem, robot=replace(robot, **{f"{limit}_limit": lower}))
+    )
+    assert with_limits_kept(hammered) is hammered
+    found = with_limits_kept(weaker)
+    assert found.status is Status.ACCEPTABLE
+    assert f"elbow has 1.05 times its {limit} limit" in found.result.message
 
 
 def test_the_effort_of_all_guesses_and_rounds_is_counted() -> None:

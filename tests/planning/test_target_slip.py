@@ -9,7 +9,18 @@ import pinocchio as pin
 import pytest
 from support.small_plans import BODILESS, arm_problem, transcribed
 
-from impactopt import GearLoad, HitRegion, Plan, Slide, solve
+from impactopt import (
+    FreeMass,
+    GearLoad,
+    HitRegion,
+    Plan,
+    Slide,
+    SpringDamper,
+    Status,
+    TargetSpeed,
+    load_problem,
+    solve,
+)
 from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.planning import lazy_constraints
 from impactopt.planning.lazy_constraints import FAR, slide, slide_caution, slides_beyond
@@ -104,3 +115,20 @@ def test_the_face_in_replays_is_beyond_the_region() -> None:
         there = TargetContact(scene_of(replace(problem, terms=terms)))
         hit = [there.depths(place[None], 0.0)[0] > 0 for place in places]
         assert hit == on_it
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kept_off", [False, True])
+def test_a_target_that_is_met_again_is_told(kept_off: bool) -> None:
+    """A plan for least energy lets the mass go on towards the arm, which stops there."""
+    apart = TargetSpeed(least=-np.inf, most=np.inf)
+    problem = replace(
+        load_problem("arm_planar"),
+        target=FreeMass(mass=5.0, initial_velocity=-3.0),
+        law=SpringDamper(stiffness=1e5, damping=100.0),
+        terms=(apart,) if kept_off else (),
+    )
+    solution = solve(problem)
+    caution, replay = solution.summary().get("caution", ""), solution.validate()
+    assert solution.status is Status.SOLVED
+    assert ("meets the target again" in caution) is (len(replay.touches) > 1) is not kept_off

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import pytest
 from support.sweep_workers import pools, slow, unlucky
 from typer.testing import CliRunner
 
-from impactopt import InputError, collide_many, load_record, sweep
+from impactopt import InputError, PowerLimit, collide_many, load_problem, load_record, sweep, write_problem
 from impactopt.cli.app import app
 from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.sweeps import SweepProgress, sweep_from_data
@@ -172,6 +173,23 @@ def test_a_failure_is_a_row_with_its_reason_and_results_are_kept_on_demand(tmp_p
     assert sweep(given, out, workers=1).failed == 2
     again = sweep(given, out, workers=1, again=True)
     assert (again.resumed, again.failed, rows(again.table)) == (1, 1, [good, bad])
+
+
+@pytest.mark.slow
+def test_a_problem_that_only_a_varied_key_completes_is_swept(tmp_path: Path) -> None:
+    """No motor of the arm has a bound on its power, so the term alone is refused; each case has a limit."""
+    problem = replace(load_problem("arm_planar"), terms=(PowerLimit(limit=1.0),))
+    text = write_problem(problem).replace("limit_W = 1.0", "")
+    (tmp_path / "arm.toml").write_text(text, "utf-8")
+    with pytest.raises(InputError, match="give a limit"):
+        load_problem(tmp_path / "arm.toml")
+    given = {
+        "sweep": {"problem": str(tmp_path / "arm.toml"), "case_kind": "strike"},
+        "grid": {"terms.power_limit.limit": [200.0, 1000.0]},
+    }
+    weak, strong = rows(sweep(given, tmp_path / "out", workers=1).table)
+    assert weak["reason"] == strong["reason"] == ""
+    assert weak["impulse_Ns"] <= strong["impulse_Ns"]
 
 
 # ---------------------------------------------------------------- workers

@@ -104,6 +104,10 @@ def _check_replaceable(directory: Path, to: str) -> None:
     others = [name for name in names if name not in exported]
     if others:
         raise InputError(f"{directory} holds {others[0]} too, which no export made; give another directory")
+    # Such a folder could be renamed, but not removed: the old export would stay beside the new one, hidden.
+    for folder in (directory, *filter(Path.is_dir, directory.rglob("*"))):
+        if not os.access(folder, os.W_OK):
+            raise InputError(f"cannot write {folder}: it is read-only; give another directory with --out")
 
 
 Array = NDArray[np.float64]

@@ -80,8 +80,8 @@ def motion_at(
 
     order (n,) : indices of the robot's joints in the order of the export.
     arrays : of the record, for `collision_*`; empty for a motion that hits nothing.
-    jumps : add both sides of the reference's jumps to the samples, `JUMP` apart; else there are samples at
-        multiples of 1 / rate only.
+    jumps : add both sides of the reference's jumps to the samples, `JUMP` apart, and the instant of the
+        largest force; else there are samples at multiples of 1 / rate only.
     """
     reference = _with_rest_at_end(reference, robot, 1 / rate)
     # multiples of 1 / rate, to the first one at or after the end, where the robot is at rest
@@ -97,6 +97,11 @@ def motion_at(
             continue
         gap = 2 * JUMP if jumps else 0.0
         inside = grid[(grid >= first + gap * (phase > 0)) & (grid < last - gap)]
+        if phase == CONTACT and jumps and len(arrays.get("collision_time", ())) > 1:
+            # The peak of the force, which may be shorter than a period.
+            peak = first + arrays["collision_time"][np.argmax(arrays["collision_force"])]
+            if first + gap <= peak < last - gap:
+                inside = np.union1d(inside[np.abs(inside - peak) > JUMP], peak)
         times = inside if not jumps else np.concatenate([[first] * (phase > 0), inside, [last] * (phase < 2)])
         if phase == 2 and jumps:
             times = np.append(times[times < reference.end], reference.end)

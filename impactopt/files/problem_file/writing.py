@@ -164,10 +164,10 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
 
 
 def _actuators(robot: Robot) -> list[dict[str, Any]]:
-    """A section for each group of joints with equal actuators."""
+    """A section for each group of joints with equal actuators, without passive joints, as of soft grips."""
     groups: dict[Actuator, list[str]] = {}
-    for joint, actuator in zip(robot.joint_names, robot.actuators, strict=True):
-        groups.setdefault(actuator, []).append(joint)
+    for k in np.flatnonzero(~robot.passive):
+        groups.setdefault(robot.actuators[k], []).append(robot.joint_names[k])
     default = Actuator()
     return [
         {"joints": joints}

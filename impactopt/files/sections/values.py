@@ -96,6 +96,14 @@ def per_joint(value: Any) -> Any:
     return value
 
 
+def _limit_per_joint(value: Any) -> Any:
+    """A number > 0, or a table."""
+    numbers = value.values() if isinstance(value, dict) else [value]
+    if not all(_is_number(x) and 0 < x < np.inf for x in numbers):
+        raise ValueError(f"{value}; give a number > 0, or a table of such numbers by joint")
+    return value
+
+
 def _joint_names(value: list[str]) -> list[str]:
     """Names, at least one."""
     if not value:
@@ -277,7 +285,7 @@ def _value(hint: Any, about: About) -> Any:
     kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     kind = next(k for k in kinds if k is not type(None))
     if about.by_joint:
-        return Annotated[Any, PlainValidator(per_joint)]
+        return Annotated[Any, PlainValidator(_limit_per_joint)]
     if about.none:
         return Annotated[Any, PlainValidator(any_margin)]
     if about.choices:

@@ -436,6 +436,25 @@ def test_toes_are_locked(tmp_path: Path) -> None:
     assert set(_robot(tmp_path, text).locked) == {"left_toe", "right_toe"}
 
 
+def test_a_joint_without_a_motor_in_a_leg_of_seven_is_locked(tmp_path: Path) -> None:
+    """With it, four axes of the leg's last six are parallel, so these cannot hold a sole."""
+    text = urdfs.biped()
+    for side in ("left", "right"):
+        text = text.replace(
+            f'<parent link="{side}_knee_link"/><child', f'<parent link="{side}_tarsus_link"/><child'
+        )
+        at = (0.0, 0.0, -0.2)
+        tarsus = urdfs.link(f"{side}_tarsus_link", 0.5, (0.05, 0.05, 0.1), (0.0, 0.0, -0.05)) + urdfs.joint(
+            f"{side}_tarsus", f"{side}_knee_link", f"{side}_tarsus_link", "0 1 0", at, (-0.9, 1.2), effort=0.0
+        )
+        text = text.replace("</robot>", tarsus + "</robot>")
+    problem = _problem(tmp_path, text)
+    data = read_toml((tmp_path / "robot.toml").read_text())["robot"]
+    assert data["locked_rad"] == {"left_tarsus": 0.0, "right_tarsus": 0.0}
+    assert "torque_limit_N_m" not in data
+    problem.robot.check_stance(problem.start_posture, tilt=1e-5)
+
+
 @pytest.mark.parametrize("spine", [True, False], ids=["spine", "torso"])
 def test_arms_that_hang_from_a_spine_or_end_in_wrists_are_no_legs(tmp_path: Path, spine: bool) -> None:
     parts = [urdfs.link("chest", 5.0, (0.2, 0.3, 0.2), (0.0, 0.0, 0.1))]

@@ -127,6 +127,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if legs:
         _check_legs(found.robot, legs)
         extra = dict.fromkeys(toes(found.robot.model, legs, found.pieces), "a toe")
+        extra |= dict.fromkeys(_undriven(found, legs, extra), "no motor")
         locked = {**locked, **extra}
         carrying = {str(found.robot.model.names[j]) for leg in legs for j in leg.path} - extra.keys()
         if extra or carrying & found.drives.torque.keys():
@@ -156,6 +157,18 @@ def _coupled_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
             leader = robot.couplings[follower].leader
             if leader not in {names[j] for j in own}:
                 out |= dict.fromkeys((leader, follower), f"{follower} follows {leader}")
+    return out
+
+
+def _undriven(found: Drafted, legs: tuple[Limb, ...], toes: Collection[str]) -> list[str]:
+    """Joints without a torque limit on legs of more than six joints of which others have one, such as Digit's
+    tarsi, which springs and rods hold; without its toes each leg keeps six.
+    """
+    out = list[str]()
+    for own in unshared(found.robot.model, legs):
+        names = [name for j in own if (name := str(found.robot.model.names[j])) not in toes]
+        free = [name for name in names if name in found.drives.torque]
+        out += free[: max(len(names) - LEG, 0)] if len(free) < len(names) else []
     return out
 
 

@@ -1172,6 +1172,14 @@ def _walker(folder: Path) -> Path:
     return xml
 
 
+def test_knees_that_an_equality_fixes_are_named_where_no_posture_is_found(tmp_path: Path) -> None:
+    xml, law = _walker(tmp_path), '<joint joint1="{}_knee" polycoef="0.4 0 0 0 0"/>'
+    laws = "".join(law.format(side) for side in ("left", "right"))
+    xml.write_text(xml.read_text().replace("</mujoco>", f"<equality>{laws}</equality></mujoco>"))
+    with pytest.raises(InputError, match=r"fixed in the file, locked: left_knee, right_knee; no posture"):
+        draft_problem(xml, folder=tmp_path, mjcf=True)
+
+
 @pytest.mark.slow
 def test_a_walker_whose_roots_frame_lies_is_drafted_upright(tmp_path: Path) -> None:
     xml = _walker(tmp_path)

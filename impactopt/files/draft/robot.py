@@ -26,6 +26,7 @@ from impactopt.robots.robot import Robot
 from impactopt.robots.urdf import read_urdf
 
 Array = NDArray[np.float64]
+FIXED = "fixed in the file"  # reason for which a joint is locked
 SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may have another dot
 
 
@@ -252,7 +253,7 @@ def _follows(model: pin.Model, tie: Tie, locked: Collection[str]) -> bool:
 
 def _why_locked(tie: Tie) -> str:
     others = [joint for joint in tie.joints if joint != tie.follower]
-    return f"{tie.follower} follows {others[0]}" if others else f"{tie.follower} is fixed"
+    return f"{tie.follower} follows {others[0]}" if others else FIXED
 
 
 def _made(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
 from impactopt.bodies.convex_hulls import LEAST_DENSITY, distance_to_link, inertia_sides, is_far, size_of
-from impactopt.bodies.file_shapes import lost_meshes
+from impactopt.bodies.file_shapes import lost_meshes, malformed_shapes
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.solids import NOT_FOUND
 from impactopt.errors import counted
@@ -154,10 +155,11 @@ def _sides(robot: Robot) -> Iterator[str]:
 
 
 def shape_doubts(robot: Robot) -> Iterator[str]:
-    """Messages about missing meshes, shapes far from their link or larger than the robot, and striking links
-    without shapes.
+    """Messages about missing meshes, malformed shapes, shapes far from their link or larger than the robot,
+    and striking links without shapes.
     """
     yield from _lost_meshes(robot)
+    yield from _malformed_shapes(robot)
     bodies = bodies_of(robot)
     for piece in bodies.too_large:
         yield (
@@ -196,6 +198,18 @@ def _lost_meshes(robot: Robot) -> Iterator[str]:
         yield (
             f"{counted(len(reasons), 'mesh is', 'meshes are')} lost, and boxes of inertia stand for links "
             f"without any: {each}{where * (NOT_FOUND in by_reason)}"
+        )
+
+
+def _malformed_shapes(robot: Robot) -> Iterator[str]:
+    """Messages about shapes that are left out, as their numbers cannot be read; each once of a link."""
+    for link, element in dict.fromkeys(
+        (link, ElementTree.tostring(element, encoding="unicode").strip())
+        for link, element in malformed_shapes(robot.urdf)
+    ):
+        yield (
+            f"a shape of link {link!r} is left out, as its kind is unknown, or its numbers are missing, no "
+            f"numbers or negative: {element}; correct it"
         )
 
 

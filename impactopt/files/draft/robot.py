@@ -338,5 +338,5 @@ def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> None:
         raise InputError(
             f"{robot.name!r} has {len(legs)} legs of {counts} joints of their own each ({listed}), and "
             f"impactopt plans for robots on two legs of {LEG} or more, which fix a sole in all its {LEG} "
-            f"directions, on two of {LEG - 1}, whose soles turn about one axis, or on a fixed base"
+            f"directions, on two of {LEG - 1}, whose soles turn about one axis, or on a fixed base (--bolted)"
         )

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from impactopt.bodies.convex_hulls import LEAST_DENSITY, distance_to_link, inertia_sides, is_far, size_of
+from impactopt.bodies.convex_hulls import FAR, LEAST_DENSITY, distance_to_link, inertia_sides, is_far, size_of
 from impactopt.bodies.file_shapes import lost_meshes, malformed_shapes
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.solids import NOT_FOUND
@@ -155,8 +155,8 @@ def _sides(robot: Robot) -> Iterator[str]:
 
 
 def shape_doubts(robot: Robot) -> Iterator[str]:
-    """Messages about missing meshes, malformed shapes, shapes far from their link or larger than the robot,
-    and striking links without shapes.
+    """Messages about missing meshes, malformed shapes, shapes and centres of mass far from their link, shapes
+    larger than the robot, and striking links without shapes.
     """
     yield from _lost_meshes(robot)
     yield from _malformed_shapes(robot)
@@ -179,6 +179,17 @@ def shape_doubts(robot: Robot) -> Iterator[str]:
                 f"a shape of link {piece.link!r}, {size_of(piece):.2g} m large, is "
                 f"{distance_to_link(robot.model, piece, same_link):.2g} m away from the link's joint, mass "
                 "and frames: correct its <origin>"
+            )
+    for joint, pieces in bodies.of_joint.items():
+        centre = np.array(robot.model.inertias[joint].lever)
+        beyond = min(-piece.depth(centre) for piece in pieces)
+        size = float(np.linalg.norm(np.ptp(np.concatenate([p.vertices for p in pieces]), axis=0)))
+        # of right models some are half of their shapes' size outside: files have shapes of parts of a link
+        if robot.model.inertias[joint].mass and beyond > max(FAR, size):
+            yield (
+                f"the centre of mass of link {bodies.name(joint)!r} is {beyond:.2g} m outside of its shapes, "
+                f"which are {size:.2g} m large: is its <inertial> in another unit or frame? Give its place "
+                "in metres, in the link's frame"
             )
 
 

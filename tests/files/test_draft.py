@@ -798,6 +798,19 @@ def test_motors_that_cannot_hold_the_arm_are_told(tmp_path: Path) -> None:
     assert draft.said.index(why) == draft.said.index(told) + 1
 
 
+def test_the_torque_of_an_excavator_is_its_own(tmp_path: Path) -> None:
+    """A boom of 4 t and 6 m needs 1.2e5 N m against gravity: its drive of 4e5 N m is no missing limit."""
+    boom = urdfs.link("boom", 4000.0, (6.0, 0.5, 0.5), (3.0, 0.0, 0.0))
+    lift = urdfs.joint(
+        "lift", "base", "boom", "0 -1 0", (0.0, 0.0, 2.0), (-0.5, 1.0), effort=4e5, velocity=0.5
+    )
+    base = urdfs.link("base", 1e4, (4.0, 3.0, 2.0), (0.0, 0.0, 1.0))
+    (tmp_path / "robot.urdf").write_text(urdfs.robot("excavator", base, boom, lift))
+    found = guess_drives(read_urdf(tmp_path / "robot.urdf", floating=False).model, {})
+    assert found.torque == {} and found.said == []
+    assert found.armature == {"lift": 400.0}
+
+
 def test_a_limit_that_no_motor_has_is_none(tmp_path: Path) -> None:
     """Exporters write 1e9 where a model has no limit: as a torque, it would have a rotor of 1e6 kg m2."""
     drafted = _robot(tmp_path, urdfs.arm(effort=1e9, velocity=1e9))

@@ -23,7 +23,10 @@ from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 SPEED = {True: 3.0, False: 0.3}  # guessed velocity limit [rad/s], [m/s]
 RANGE = (-3.14, 3.14)  # [rad] guessed position limits
 MIN_TORQUE = {True: 2.0, False: 50.0}  # [N m], [N]
-PLAUSIBLE_TORQUE = {True: 500.0, False: 1e4}  # [N m], [N]: larger limits are reported
+# Drives of any size have limits up to this multiple of the gravity torque, as that of an excavator's boom.
+USUAL_FACTOR = 10.0
+# [N m], [N]: larger limits are reported
+PLAUSIBLE_TORQUE = {True: 500.0, False: 1e4}
 GRAVITY_FACTOR = 3.0  # guessed torque limit over the largest gravity torque
 LEVER = 0.3  # [m]: weight x lever is the least torque limit of a leg's joints
 PLAUSIBLE_SPEED = 60.0  # [rad/s], [m/s]: larger limits are reported
@@ -69,10 +72,11 @@ def guess_drives(
         revolute = not slides[k]
         effort, rate, inertia = ("N m", "rad/s", "kg m2") if revolute else ("N", "m/s", "kg")
         limit = known.get(joint, float(torque[k]))
-        if not 0 < limit < LARGEST_TORQUE[revolute]:
+        usual = USUAL_FACTOR * gravity[k]
+        if not 0 < limit < max(LARGEST_TORQUE[revolute], usual):
             least = max(MIN_TORQUE[revolute], leg_torque * (joint in carrying))
             out.torque[joint] = limit = _rounded(max(GRAVITY_FACTOR * gravity[k], least))
-        elif limit > PLAUSIBLE_TORQUE[revolute]:
+        elif limit > max(PLAUSIBLE_TORQUE[revolute], usual):
             out.said.append(f"torque limit of {joint}, {limit:g} {effort}: hard to believe")
         if not 0 < speed[k] < LARGEST_SPEED:
             out.velocity[joint] = SPEED[revolute]

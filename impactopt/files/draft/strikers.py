@@ -66,6 +66,8 @@ def find_striker(
         return Striker(name=name, frame=str(tool.name), point=np.round(local, 4) + 0.0), axis
     parent, above = first_link(model, limb.tip)
     frames = [f.placement.translation for f in model.frames if f.parentJoint == limb.tip]
+    if not points:  # a link without shapes reaches to its centre of mass at least
+        frames.append(np.array(model.inertias[limb.tip].lever))
     axis = _axis(model, limb, points, frames, away)
     everything = np.concatenate([*points, np.array(frames).reshape(-1, 3)])
     point = axis * max(float((everything @ axis).max()), 0.0)

@@ -819,6 +819,13 @@ def test_the_torque_of_an_excavator_is_its_own(tmp_path: Path) -> None:
     assert found.armature == {"lift": 400.0}
 
 
+def test_the_torque_of_an_excavator_in_an_arm_is_not_believed(tmp_path: Path) -> None:
+    """Some files have 20 or 50 kN m in each joint of a humanoid: a rotor for that outweighs the robot."""
+    found = _robot(tmp_path, urdfs.arm(effort=5e4)).drives
+    assert found.torque == _robot(tmp_path, urdfs.arm(effort=0.0)).drives.torque != {}
+    assert "torque limit of shoulder, 50000 N m: hard to believe, and guessed" in found.said
+
+
 def test_a_limit_that_no_motor_has_is_none(tmp_path: Path) -> None:
     """Exporters write 1e9 where a model has no limit: as a torque, it would have a rotor of 1e6 kg m2."""
     drafted = _robot(tmp_path, urdfs.arm(effort=1e9, velocity=1e9))

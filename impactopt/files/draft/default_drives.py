@@ -23,15 +23,15 @@ from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 SPEED = {True: 3.0, False: 0.3}  # guessed velocity limit [rad/s], [m/s]
 RANGE = (-3.14, 3.14)  # [rad] guessed position limits
 MIN_TORQUE = {True: 2.0, False: 50.0}  # [N m], [N]
-# Drives of any size have limits up to this multiple of the gravity torque, as that of an excavator's boom.
-USUAL_FACTOR = 10.0
-# [N m], [N]: larger limits are reported
-PLAUSIBLE_TORQUE = {True: 500.0, False: 1e4}
+# [N m], [N], or the robot's largest gravity torque times a factor, as an excavator's are large: higher limits
+# are reported
+PLAUSIBLE_TORQUE, PLAUSIBLE_FACTOR = {True: 500.0, False: 1e4}, 10.0
 GRAVITY_FACTOR = 3.0  # guessed torque limit over the largest gravity torque
 LEVER = 0.3  # [m]: weight x lever is the least torque limit of a leg's joints
 PLAUSIBLE_SPEED = 60.0  # [rad/s], [m/s]: larger limits are reported
-# Larger limits stand for none: no robot's motor reaches them
-LARGEST_TORQUE = {True: 1e5, False: 1e6}  # [N m], [N]
+# Larger limits stand for none: no robot's motor reaches them, nor more than 25 times that gravity torque
+LARGEST_TORQUE, LARGEST_FACTOR = {True: 5e3, False: 1e6}, 50.0  # [N m], [N]
+UNLIMITED = 1e6  # [N m], [N]: the file itself means none
 LARGEST_SPEED = 1e3  # [rad/s], [m/s]
 DOUBT = "a GUESS"
 
@@ -67,17 +67,21 @@ def guess_drives(
     base, slides = model.nv - len(joints), prismatic(model)
     torque, speed = effort_limit(model)[base:], velocity_limit(model)[base:]
     gravity = _largest_gravity(model)
+    heaviest = {
+        kind: max([0.0, *(g for g, s in zip(gravity, slides, strict=True) if s != kind)]) for kind in SPEED
+    }
     leg_torque = LEVER * 9.81 * sum(float(body.mass) for body in model.inertias)
     for k, joint in enumerate(joints):
         revolute = not slides[k]
         effort, rate, inertia = ("N m", "rad/s", "kg m2") if revolute else ("N", "m/s", "kg")
         limit = known.get(joint, float(torque[k]))
-        usual = USUAL_FACTOR * gravity[k]
-        if not 0 < limit < max(LARGEST_TORQUE[revolute], usual):
+        given, heavy = limit, heaviest[revolute]
+        if not 0 < limit < max(LARGEST_TORQUE[revolute], LARGEST_FACTOR * heavy):
             least = max(MIN_TORQUE[revolute], leg_torque * (joint in carrying))
             out.torque[joint] = limit = _rounded(max(GRAVITY_FACTOR * gravity[k], least))
-        elif limit > max(PLAUSIBLE_TORQUE[revolute], usual):
-            out.said.append(f"torque limit of {joint}, {limit:g} {effort}: hard to believe")
+        if max(PLAUSIBLE_TORQUE[revolute], PLAUSIBLE_FACTOR * heavy) < given < UNLIMITED:
+            guessed = ", and guessed" if joint in out.torque else ""
+            out.said.append(f"torque limit of {joint}, {given:g} {effort}: hard to believe{guessed}")
         if not 0 < speed[k] < LARGEST_SPEED:
             out.velocity[joint] = SPEED[revolute]
         elif speed[k] > PLAUSIBLE_SPEED:

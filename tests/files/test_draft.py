@@ -161,7 +161,8 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
     for text, motion, why in (
         (urdfs.arm(), "kick", "does not stand on legs"),
         (urdfs.biped(arms=False), "punch", "no limb beside the legs"),
-        (urdfs.biped(legs=5, arms=False), None, "would swing on its hinge"),
+        (urdfs.biped(legs=5, arms=False), None, "would swing on its hinge; bolt it to the ground"),
+        (urdfs.biped(legs=5), "kick", "would swing on its hinge; let it punch"),
         (urdfs.biped(arms=False), "nail", "no limb beside the legs to nail with"),
         (urdfs.arm(), "slap", "give punch, kick, chop or nail"),
     ):

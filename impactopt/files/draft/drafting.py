@@ -391,7 +391,8 @@ def _kick(
     """
     if any(sole.hinge is not None for sole in soles):
         raise InputError(
-            f"{drafted.path}: legs of five joints cannot kick: a foot in the air would swing on its hinge"
+            f"{drafted.path}: legs of five joints cannot kick: a foot in the air would swing on its hinge; "
+            + ("let it punch" if drafted.arms else "bolt it to the ground (--bolted)")
         )
     lifted = max(range(len(soles)), key=lambda k: soles[k].name == "right")
     foot, stands = soles[lifted], soles[1 - lifted]

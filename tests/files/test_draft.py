@@ -827,6 +827,23 @@ def test_the_torque_of_an_excavator_in_an_arm_is_not_believed(tmp_path: Path) ->
     assert "torque limit of shoulder, 50000 N m: hard to believe, and guessed" in found.said
 
 
+def test_a_guessed_rotor_bears_the_servo_of_the_file(tmp_path: Path) -> None:
+    """An MJCF with stiff servos, and neither torque limits nor armature, as of an iiwa 14, was refused."""
+    pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    path.write_text("""
+        <mujoco><default><geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></default><worldbody>
+        <body name="base"><geom/><body name="upper" pos="0 0 .1">
+        <joint name="shoulder" axis="0 1 0" range="-100 100"/><geom/>
+        <body name="lower" pos="0 0 .05"><joint name="elbow" axis="0 1 0" range="-140 140"/><geom/>
+        </body></body></body></worldbody><actuator><position joint="shoulder" kp="2000" kv="200"/>
+        <position joint="elbow" kp="2000" kv="200"/></actuator></mujoco>
+    """)
+    robot = draft_robot(path, mjcf=True).robot
+    assert (robot.kd == 200.0).all()
+    assert robot.armature == pytest.approx(2 * 200.0 / 3e4, rel=0.05)
+
+
 def test_a_limit_that_no_motor_has_is_none(tmp_path: Path) -> None:
     """Exporters write 1e9 where a model has no limit: as a torque, it would have a rotor of 1e6 kg m2."""
     drafted = _robot(tmp_path, urdfs.arm(effort=1e9, velocity=1e9))

@@ -16,6 +16,7 @@ from impactopt.robots.build import (
     prismatic,
     velocity_limit,
 )
+from impactopt.robots.checks import MAX_SERVO_RATE
 from impactopt.robots.couplings import Coupling, axis_of, couplings_of
 from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 
@@ -33,6 +34,7 @@ PLAUSIBLE_SPEED = 60.0  # [rad/s], [m/s]: larger limits are reported
 LARGEST_TORQUE, LARGEST_FACTOR = {True: 5e3, False: 1e6}, 50.0  # [N m], [N]
 UNLIMITED = 1e6  # [N m], [N]: the file itself means none
 LARGEST_SPEED = 1e3  # [rad/s], [m/s]
+SERVO_MARGIN = 2.0  # largest rate of a servo over that on a guessed rotor alone
 DOUBT = "a GUESS"
 
 
@@ -56,11 +58,12 @@ def guess_drives(
     known: Mapping[str, float],
     carrying: Collection[str] = (),
     unranged: Collection[str] = (),
+    kd: Mapping[str, float] | None = None,
 ) -> Drives:
     """Guesses of the missing drive parameters of each joint.
 
     known : torque limits that are not in the model.  carrying : joints of legs, which carry the robot.
-    unranged : joints without position limits.
+    unranged : joints without position limits.  kd : servo damping of the file, which a guessed rotor bears.
     """
     out, joints = Drives(), joint_names(model)
     out.position = {joint: RANGE for joint in joints if joint in unranged}
@@ -92,7 +95,8 @@ def guess_drives(
                 out.said.append(
                     f"armature of {joint}, {armature:.2g} {inertia}: hard to believe, and guessed"
                 )
-            out.armature[joint] = _rounded(USUAL_ROTOR * limit)
+            least = SERVO_MARGIN * (kd or {}).get(joint, 0.0) / MAX_SERVO_RATE
+            out.armature[joint] = _rounded(max(USUAL_ROTOR * limit, least))
     return out
 
 

@@ -265,7 +265,7 @@ def _made(
         if tie.follower in locked:
             angles[tie.follower] = _followed(read.model, tie, angles)
     model = read.moving(angles)
-    drives = guess_drives(model, read.torque, carrying, read.unranged)
+    drives = guess_drives(model, read.torque, carrying, read.unranged, read.kd)
     wrong: tuple[str, ...] = ()
     try:
         check_inertias(model)

@@ -701,11 +701,13 @@ def test_a_tool_frame_wins_over_shapes(tmp_path: Path, name: str, place: str, po
     assert striker.frame == name and striker.point == pytest.approx(point, abs=1e-6)
 
 
-def test_a_hand_without_shapes_reaches_to_its_centre_of_mass(tmp_path: Path) -> None:
+@pytest.mark.parametrize("tool", [False, True])
+def test_a_hand_without_shapes_reaches_to_its_centre_of_mass(tmp_path: Path, tool: bool) -> None:
     """At its joint, as before, the link before touches first: Spot's arm without its gripper had no plan."""
     hand = urdfs.link("flange", 0.5, (0.05, 0.05, 0.2), (0.0, 0.0, 0.1)).replace("collision>", "hidden>")
     own = urdfs.link("flange", 0.2, (0.07, 0.07, 0.03), (0.0, 0.0, -0.015))
-    striker, axis = _striker(tmp_path, _flange().replace(own, hand))
+    frame = _fixed("flange", "tool0", 'xyz="0 0 0"') if tool else ""
+    striker, axis = _striker(tmp_path, _flange(frame).replace(own, hand))
     assert striker.point == pytest.approx([0.0, 0.0, 0.1]) and axis == pytest.approx([0.0, 0.0, 1.0])
 
 

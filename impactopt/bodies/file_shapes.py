@@ -90,6 +90,27 @@ def lost_meshes(model: Any, urdf: str | None, *, without: Collection[int] = ()) 
     return lost
 
 
+def malformed_shapes(urdf: str | None) -> Iterator[tuple[str, ElementTree.Element]]:
+    """Links of a URDF, and the element of each of their shapes whose numbers cannot be read or are negative,
+    or whose kind is unknown.
+    """
+    for link in urdf_elements(urdf, "link"):
+        for element in (*link.findall("collision"), *link.findall("visual")):
+            origin = element.find("origin")
+            if origin is not None and _origin(origin) is None:
+                yield link.get("name", ""), origin
+            shape = element.find("geometry/*")
+            if shape is None or ":" in shape.tag:  # of another tool
+                continue
+            try:
+                if shape.tag == "mesh":  # its file may be lost for reasons of its own
+                    numbers(shape.get("scale", "1 1 1"))
+                elif _primitive(shape) is None:
+                    raise ValueError(shape.tag)
+            except (ValueError, KeyError):
+                yield link.get("name", ""), shape
+
+
 def numbers(text: str, count: int = 3) -> Array:
     """Finite numbers of a text, separated by spaces; ValueError unless there are `count` of them."""
     found = np.array([float(word) for word in text.split()])
@@ -102,16 +123,35 @@ def _urdf_solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | Non
     """Solid of a <geometry>; None if it has none, or its mesh cannot be read."""
     for shape in geometry if geometry is not None else ():
         with contextlib.suppress(ValueError, RuntimeError, OSError, KeyError):
-            if shape.tag == "box":
-                return box(numbers(shape.attrib["size"]))
-            if shape.tag in ("cylinder", "capsule"):
-                make = cylinder if shape.tag == "cylinder" else capsule
-                return make(*(float(numbers(shape.attrib[key], 1)[0]) for key in ("radius", "length")))
-            if shape.tag == "sphere":
-                return sphere(float(numbers(shape.attrib["radius"], 1)[0]))
             if shape.tag == "mesh":
                 scale = numbers(shape.get("scale", "1 1 1"))
                 return read_mesh(find_mesh(shape.attrib["filename"], urdf), scale)
+            if (solid := _primitive(shape)) is not None:
+                return solid
+    return None
+
+
+def _primitive(shape: ElementTree.Element) -> Solid | None:
+    """Solid of a shape that is no mesh; None of an unknown kind.
+
+    Raises
+    ------
+    ValueError, KeyError : its numbers cannot be read, or are negative; one is missing.
+    """
+
+    def sizes(key: str, count: int = 1) -> Array:
+        found = numbers(shape.attrib[key], count)
+        if (found < 0).any():
+            raise ValueError(f"{shape.attrib[key]!r} is negative")
+        return found
+
+    if shape.tag == "box":
+        return box(sizes("size", 3))
+    if shape.tag == "sphere":
+        return sphere(sizes("radius").item())
+    if shape.tag in ("cylinder", "capsule"):
+        make = cylinder if shape.tag == "cylinder" else capsule
+        return make(sizes("radius").item(), sizes("length").item())
     return None
 
 

@@ -116,7 +116,8 @@ def slide_caution(length: float) -> str:
         return ""
     return (
         f"The striking point slides {1e3 * length:.0f} mm across the target. "
-        f"In replays the face ends {1e3 * FACE:.0f} mm from the hit point; [terms.slide] keeps it there."
+        f"In replays the face ends {1e3 * FACE:.0f} mm from the hit point; a smaller most_m in "
+        "[terms.slide] keeps it nearer."
     )
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
-from impactopt.bodies.convex_hulls import LEAST_DENSITY, distance_to_link, inertia_sides, is_far, size_of
-from impactopt.bodies.file_shapes import lost_meshes
+from impactopt.bodies.convex_hulls import FAR, LEAST_DENSITY, distance_to_link, inertia_sides, is_far, size_of
+from impactopt.bodies.file_shapes import lost_meshes, malformed_shapes
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.solids import NOT_FOUND
 from impactopt.errors import counted
@@ -154,10 +155,11 @@ def _sides(robot: Robot) -> Iterator[str]:
 
 
 def shape_doubts(robot: Robot) -> Iterator[str]:
-    """Messages about missing meshes, shapes far from their link or larger than the robot, and striking links
-    without shapes.
+    """Messages about missing meshes, malformed shapes, shapes and centres of mass far from their link, shapes
+    larger than the robot, and striking links without shapes.
     """
     yield from _lost_meshes(robot)
+    yield from _malformed_shapes(robot)
     bodies = bodies_of(robot)
     for piece in bodies.too_large:
         yield (
@@ -178,6 +180,17 @@ def shape_doubts(robot: Robot) -> Iterator[str]:
                 f"{distance_to_link(robot.model, piece, same_link):.2g} m away from the link's joint, mass "
                 "and frames: correct its <origin>"
             )
+    for joint, pieces in bodies.of_joint.items():
+        centre = np.array(robot.model.inertias[joint].lever)
+        beyond = min(-piece.depth(centre) for piece in pieces)
+        size = float(np.linalg.norm(np.ptp(np.concatenate([p.vertices for p in pieces]), axis=0)))
+        # of right models some are half of their shapes' size outside: files have shapes of parts of a link
+        if robot.model.inertias[joint].mass and beyond > max(FAR, size):
+            yield (
+                f"the centre of mass of link {bodies.name(joint)!r} is {beyond:.2g} m outside of its shapes, "
+                f"which are {size:.2g} m large: is its <inertial> in another unit or frame? Give its place "
+                "in metres, in the link's frame"
+            )
 
 
 def _lost_meshes(robot: Robot) -> Iterator[str]:
@@ -196,6 +209,18 @@ def _lost_meshes(robot: Robot) -> Iterator[str]:
         yield (
             f"{counted(len(reasons), 'mesh is', 'meshes are')} lost, and boxes of inertia stand for links "
             f"without any: {each}{where * (NOT_FOUND in by_reason)}"
+        )
+
+
+def _malformed_shapes(robot: Robot) -> Iterator[str]:
+    """Messages about shapes that are left out, as their numbers cannot be read; each once of a link."""
+    for link, element in dict.fromkeys(
+        (link, ElementTree.tostring(element, encoding="unicode").strip())
+        for link, element in malformed_shapes(robot.urdf)
+    ):
+        yield (
+            f"a shape of link {link!r} is left out, as its kind is unknown, or its numbers are missing, no "
+            f"numbers or negative: {element}; correct it"
         )
 
 

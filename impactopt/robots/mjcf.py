@@ -321,6 +321,9 @@ def compile_mjcf(path: str | PathLike[str]) -> Any:
     except (OSError, ValueError) as error:
         whole = _including(Path(file))
         fix = f"; {whole} includes this file: give that one" if whole else ""
+        with contextlib.suppress(OSError, ElementTree.ParseError):
+            if ElementTree.parse(file).getroot().tag == "robot":
+                fix = "; it is a URDF: give it by --urdf, or `urdf` in [robot]"
         raise InputError(f"MJCF {file}: {error}{fix}") from error
 
 

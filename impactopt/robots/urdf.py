@@ -46,6 +46,11 @@ def read_urdf(
     urdf = existing(path, "URDF")
     joints = (pin.JointModelFreeFlyer(),) if floating else ()
     root = parse_urdf(urdf)
+    if root.tag != "robot":
+        raise InputError(
+            f"{urdf} is no URDF: its first element is <{root.tag}>, not <robot>"
+            + ("; give it as an MJCF: --mjcf, or `mjcf` in [robot]" * (root.tag == "mujoco"))
+        )
     if any(tag.tag.startswith("xacro:") for tag in root.iter()):
         raise InputError(
             f"{urdf} is a xacro file, not yet a URDF: run `xacro {Path(urdf).name} > robot.urdf`, and give "

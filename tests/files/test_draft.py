@@ -161,7 +161,8 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
     for text, motion, why in (
         (urdfs.arm(), "kick", "does not stand on legs"),
         (urdfs.biped(arms=False), "punch", "no limb beside the legs"),
-        (urdfs.biped(legs=5, arms=False), None, "would swing on its hinge"),
+        (urdfs.biped(legs=5, arms=False), None, "would swing on its hinge; bolt it to the ground"),
+        (urdfs.biped(legs=5), "kick", "would swing on its hinge; let it punch"),
         (urdfs.biped(arms=False), "nail", "no limb beside the legs to nail with"),
         (urdfs.arm(), "slap", "give punch, kick, chop or nail"),
     ):
@@ -436,6 +437,25 @@ def test_toes_are_locked(tmp_path: Path) -> None:
     assert set(_robot(tmp_path, text).locked) == {"left_toe", "right_toe"}
 
 
+def test_a_joint_without_a_motor_in_a_leg_of_seven_is_locked(tmp_path: Path) -> None:
+    """With it, four axes of the leg's last six are parallel, so these cannot hold a sole."""
+    text = urdfs.biped()
+    for side in ("left", "right"):
+        text = text.replace(
+            f'<parent link="{side}_knee_link"/><child', f'<parent link="{side}_tarsus_link"/><child'
+        )
+        at = (0.0, 0.0, -0.2)
+        tarsus = urdfs.link(f"{side}_tarsus_link", 0.5, (0.05, 0.05, 0.1), (0.0, 0.0, -0.05)) + urdfs.joint(
+            f"{side}_tarsus", f"{side}_knee_link", f"{side}_tarsus_link", "0 1 0", at, (-0.9, 1.2), effort=0.0
+        )
+        text = text.replace("</robot>", tarsus + "</robot>")
+    problem = _problem(tmp_path, text)
+    data = read_toml((tmp_path / "robot.toml").read_text())["robot"]
+    assert data["locked_rad"] == {"left_tarsus": 0.0, "right_tarsus": 0.0}
+    assert "torque_limit_N_m" not in data
+    problem.robot.check_stance(problem.start_posture, tilt=1e-5)
+
+
 @pytest.mark.parametrize("spine", [True, False], ids=["spine", "torso"])
 def test_arms_that_hang_from_a_spine_or_end_in_wrists_are_no_legs(tmp_path: Path, spine: bool) -> None:
     parts = [urdfs.link("chest", 5.0, (0.2, 0.3, 0.2), (0.0, 0.0, 0.1))]
@@ -681,6 +701,16 @@ def test_a_tool_frame_wins_over_shapes(tmp_path: Path, name: str, place: str, po
     assert striker.frame == name and striker.point == pytest.approx(point, abs=1e-6)
 
 
+@pytest.mark.parametrize("tool", [False, True])
+def test_a_hand_without_shapes_reaches_to_its_centre_of_mass(tmp_path: Path, tool: bool) -> None:
+    """At its joint, as before, the link before touches first: Spot's arm without its gripper had no plan."""
+    hand = urdfs.link("flange", 0.5, (0.05, 0.05, 0.2), (0.0, 0.0, 0.1)).replace("collision>", "hidden>")
+    own = urdfs.link("flange", 0.2, (0.07, 0.07, 0.03), (0.0, 0.0, -0.015))
+    frame = _fixed("flange", "tool0", 'xyz="0 0 0"') if tool else ""
+    striker, axis = _striker(tmp_path, _flange(frame).replace(own, hand))
+    assert striker.point == pytest.approx([0.0, 0.0, 0.1]) and axis == pytest.approx([0.0, 0.0, 1.0])
+
+
 def test_of_a_tool_at_the_joint_itself_a_long_hand_strikes(tmp_path: Path) -> None:
     """Where it ends, though the arm comes from another side."""
     hand = urdfs.link("hand", 0.3, (0.2, 0.05, 0.05), (0.1, 0.0, 0.0))
@@ -777,6 +807,43 @@ def test_motors_that_cannot_hold_the_arm_are_told(tmp_path: Path) -> None:
     (told,) = [line for line in draft.said if "no whole motion" in line]
     (why,) = [line for line in draft.said if "do not hold the robot's own weight" in line]
     assert draft.said.index(why) == draft.said.index(told) + 1
+
+
+def test_the_torque_of_an_excavator_is_its_own(tmp_path: Path) -> None:
+    """A boom of 4 t and 6 m needs 1.2e5 N m against gravity: its drive of 4e5 N m is no missing limit."""
+    boom = urdfs.link("boom", 4000.0, (6.0, 0.5, 0.5), (3.0, 0.0, 0.0))
+    lift = urdfs.joint(
+        "lift", "base", "boom", "0 -1 0", (0.0, 0.0, 2.0), (-0.5, 1.0), effort=4e5, velocity=0.5
+    )
+    base = urdfs.link("base", 1e4, (4.0, 3.0, 2.0), (0.0, 0.0, 1.0))
+    (tmp_path / "robot.urdf").write_text(urdfs.robot("excavator", base, boom, lift))
+    found = guess_drives(read_urdf(tmp_path / "robot.urdf", floating=False).model, {})
+    assert found.torque == {} and found.said == []
+    assert found.armature == {"lift": 400.0}
+
+
+def test_the_torque_of_an_excavator_in_an_arm_is_not_believed(tmp_path: Path) -> None:
+    """Some files have 20 or 50 kN m in each joint of a humanoid: a rotor for that outweighs the robot."""
+    found = _robot(tmp_path, urdfs.arm(effort=5e4)).drives
+    assert found.torque == _robot(tmp_path, urdfs.arm(effort=0.0)).drives.torque != {}
+    assert "torque limit of shoulder, 50000 N m: hard to believe, and guessed" in found.said
+
+
+def test_a_guessed_rotor_bears_the_servo_of_the_file(tmp_path: Path) -> None:
+    """An MJCF with stiff servos, and neither torque limits nor armature, as of an iiwa 14, was refused."""
+    pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    path.write_text("""
+        <mujoco><default><geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></default><worldbody>
+        <body name="base"><geom/><body name="upper" pos="0 0 .1">
+        <joint name="shoulder" axis="0 1 0" range="-100 100"/><geom/>
+        <body name="lower" pos="0 0 .05"><joint name="elbow" axis="0 1 0" range="-140 140"/><geom/>
+        </body></body></body></worldbody><actuator><position joint="shoulder" kp="2000" kv="200"/>
+        <position joint="elbow" kp="2000" kv="200"/></actuator></mujoco>
+    """)
+    robot = draft_robot(path, mjcf=True).robot
+    assert (robot.kd == 200.0).all()
+    assert robot.armature == pytest.approx(2 * 200.0 / 3e4, rel=0.05)
 
 
 def test_a_limit_that_no_motor_has_is_none(tmp_path: Path) -> None:
@@ -894,7 +961,7 @@ def test_bad_inertias_are_listed_and_their_repair_has_to_be_said(tmp_path: Path)
     ("text", "said"),
     [
         (urdfs.biped(legs=4), "2 legs of 4 joints .*left_hip_pitch.*two legs of 6 or more.* two of 5"),
-        (urdfs.biped(pairs=2), "4 legs of 6 joints"),
+        (urdfs.biped(pairs=2), "4 legs of 6 joints.*--bolted"),
     ],
     ids=["four joints", "four legs"],
 )
@@ -1151,6 +1218,14 @@ def _walker(folder: Path) -> Path:
     path.write_text(urdfs.biped().replace("</robot>", kept))
     mujoco.mj_saveLastXML(str(xml), mujoco.MjModel.from_xml_path(str(path)))
     return xml
+
+
+def test_knees_that_an_equality_fixes_are_named_where_no_posture_is_found(tmp_path: Path) -> None:
+    xml, law = _walker(tmp_path), '<joint joint1="{}_knee" polycoef="0.4 0 0 0 0"/>'
+    laws = "".join(law.format(side) for side in ("left", "right"))
+    xml.write_text(xml.read_text().replace("</mujoco>", f"<equality>{laws}</equality></mujoco>"))
+    with pytest.raises(InputError, match=r"fixed in the file, locked: left_knee, right_knee; no posture"):
+        draft_problem(xml, folder=tmp_path, mjcf=True)
 
 
 @pytest.mark.slow

@@ -135,6 +135,50 @@ def _checked(file: Path, text: str, *settings: str) -> str:
     return done.stdout
 
 
+@pytest.mark.parametrize(
+    "shape",
+    [
+        '<capsule radius="0.04" />',
+        '<capsule radius="0.04" length="-0.3" />',
+        '<cylinder radius="nan" length="0.3" />',
+        '<box size="0.08 0.08" />',
+        '<sphere radius="4 cm" />',
+        '<mesh filename="arm.stl" scale="1 1" />',
+        '<cone radius="0.04" length="0.3" />',
+    ],
+)
+def test_a_malformed_shape_is_told(tmp_path: Path, shape: str) -> None:
+    text = urdfs.arm().replace('<box size="0.08 0.08 0.3"/>', shape, 1)
+    (tmp_path / "robot.urdf").write_text(text)
+    told = doubts(Robot.from_urdf(tmp_path / "robot.urdf", floating=False, armature=0.1))
+    (line,) = [line for line in told if not line.startswith("1 mesh is lost")]
+    assert line.startswith("a shape of link 'shoulder_link' is left out") and shape in line
+
+
+def test_a_malformed_place_of_a_shape_is_told(tmp_path: Path) -> None:
+    text = urdfs.arm().replace(
+        '<collision><origin xyz="0.0 0.0 0.15"/>', '<collision><origin xyz="0.15"/>', 1
+    )
+    (tmp_path / "robot.urdf").write_text(text)
+    (line,) = doubts(Robot.from_urdf(tmp_path / "robot.urdf", floating=False, armature=0.1))
+    assert "shoulder_link" in line and '<origin xyz="0.15" />' in line
+
+
+@pytest.mark.parametrize(
+    ("height", "doubted"), [("0.15", False), ("0.5", False), ("0.8", True), ("150", True)]
+)
+def test_a_centre_of_mass_far_outside_of_its_shapes_is_doubted(
+    tmp_path: Path, height: str, doubted: bool
+) -> None:
+    """In millimetres, or in the base's frame; the link's box of 0.08 x 0.08 x 0.3 m ends at 0.3 m."""
+    text = urdfs.arm().replace('<inertial><origin xyz="0.0 0.0 0.15"/>', "<inertial><origin/>", 1)
+    (tmp_path / "robot.urdf").write_text(text.replace("<origin/>", f'<origin xyz="0 0 {height}"/>'))
+    told = doubts(Robot.from_urdf(tmp_path / "robot.urdf", floating=False, armature=0.1))
+    beyond = float(height) - 0.3
+    line = f"the centre of mass of link 'shoulder_link' is {beyond:.2g} m outside of its shapes, which are "
+    assert [text.startswith(line) for text in told] == [True] * doubted
+
+
 def test_a_striking_link_without_shapes_is_doubted(tmp_path: Path) -> None:
     whole = urdfs.arm()
     before, _, hand = whole.partition('<link name="wrist_link">')

@@ -16,6 +16,7 @@ from impactopt.robots.build import (
     prismatic,
     velocity_limit,
 )
+from impactopt.robots.checks import MAX_SERVO_RATE
 from impactopt.robots.couplings import Coupling, axis_of, couplings_of
 from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 
@@ -23,13 +24,17 @@ from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 SPEED = {True: 3.0, False: 0.3}  # guessed velocity limit [rad/s], [m/s]
 RANGE = (-3.14, 3.14)  # [rad] guessed position limits
 MIN_TORQUE = {True: 2.0, False: 50.0}  # [N m], [N]
-PLAUSIBLE_TORQUE = {True: 500.0, False: 1e4}  # [N m], [N]: larger limits are reported
+# [N m], [N], or the robot's largest gravity torque times a factor, as an excavator's are large: higher limits
+# are reported
+PLAUSIBLE_TORQUE, PLAUSIBLE_FACTOR = {True: 500.0, False: 1e4}, 10.0
 GRAVITY_FACTOR = 3.0  # guessed torque limit over the largest gravity torque
 LEVER = 0.3  # [m]: weight x lever is the least torque limit of a leg's joints
 PLAUSIBLE_SPEED = 60.0  # [rad/s], [m/s]: larger limits are reported
-# Larger limits stand for none: no robot's motor reaches them
-LARGEST_TORQUE = {True: 1e5, False: 1e6}  # [N m], [N]
+# Larger limits stand for none: no robot's motor reaches them, nor more than 25 times that gravity torque
+LARGEST_TORQUE, LARGEST_FACTOR = {True: 5e3, False: 1e6}, 50.0  # [N m], [N]
+UNLIMITED = 1e6  # [N m], [N]: the file itself means none
 LARGEST_SPEED = 1e3  # [rad/s], [m/s]
+SERVO_MARGIN = 2.0  # largest rate of a servo over that on a guessed rotor alone
 DOUBT = "a GUESS"
 
 
@@ -53,27 +58,33 @@ def guess_drives(
     known: Mapping[str, float],
     carrying: Collection[str] = (),
     unranged: Collection[str] = (),
+    kd: Mapping[str, float] | None = None,
 ) -> Drives:
     """Guesses of the missing drive parameters of each joint.
 
     known : torque limits that are not in the model.  carrying : joints of legs, which carry the robot.
-    unranged : joints without position limits.
+    unranged : joints without position limits.  kd : servo damping of the file, which a guessed rotor bears.
     """
     out, joints = Drives(), joint_names(model)
     out.position = {joint: RANGE for joint in joints if joint in unranged}
     base, slides = model.nv - len(joints), prismatic(model)
     torque, speed = effort_limit(model)[base:], velocity_limit(model)[base:]
     gravity = _largest_gravity(model)
+    heaviest = {
+        kind: max([0.0, *(g for g, s in zip(gravity, slides, strict=True) if s != kind)]) for kind in SPEED
+    }
     leg_torque = LEVER * 9.81 * sum(float(body.mass) for body in model.inertias)
     for k, joint in enumerate(joints):
         revolute = not slides[k]
         effort, rate, inertia = ("N m", "rad/s", "kg m2") if revolute else ("N", "m/s", "kg")
         limit = known.get(joint, float(torque[k]))
-        if not 0 < limit < LARGEST_TORQUE[revolute]:
+        given, heavy = limit, heaviest[revolute]
+        if not 0 < limit < max(LARGEST_TORQUE[revolute], LARGEST_FACTOR * heavy):
             least = max(MIN_TORQUE[revolute], leg_torque * (joint in carrying))
             out.torque[joint] = limit = _rounded(max(GRAVITY_FACTOR * gravity[k], least))
-        elif limit > PLAUSIBLE_TORQUE[revolute]:
-            out.said.append(f"torque limit of {joint}, {limit:g} {effort}: hard to believe")
+        if max(PLAUSIBLE_TORQUE[revolute], PLAUSIBLE_FACTOR * heavy) < given < UNLIMITED:
+            guessed = ", and guessed" if joint in out.torque else ""
+            out.said.append(f"torque limit of {joint}, {given:g} {effort}: hard to believe{guessed}")
         if not 0 < speed[k] < LARGEST_SPEED:
             out.velocity[joint] = SPEED[revolute]
         elif speed[k] > PLAUSIBLE_SPEED:
@@ -84,7 +95,8 @@ def guess_drives(
                 out.said.append(
                     f"armature of {joint}, {armature:.2g} {inertia}: hard to believe, and guessed"
                 )
-            out.armature[joint] = _rounded(USUAL_ROTOR * limit)
+            least = SERVO_MARGIN * (kd or {}).get(joint, 0.0) / MAX_SERVO_RATE
+            out.armature[joint] = _rounded(max(USUAL_ROTOR * limit, least))
     return out
 
 

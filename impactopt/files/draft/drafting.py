@@ -23,7 +23,7 @@ from impactopt.files.draft.default_drives import DOUBT
 from impactopt.files.draft.hits import Hit, hits
 from impactopt.files.draft.limbs import NO_RANGE, Limb, renumbered
 from impactopt.files.draft.postures import eased, half_sitting, rested
-from impactopt.files.draft.robot import Drafted, draft_robot
+from impactopt.files.draft.robot import FIXED, Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_edge, find_striker, find_toe
 from impactopt.files.draft.strong import FOLLOW, ITERATIONS, SECONDS, SWING, Strong, durations, strongest
@@ -113,8 +113,9 @@ def draft_problem(
     except InputError as error:
         # the reason, where a robot of that size, with such shapes or limits has no sole or posture
         causes = [*unit_doubts(drafted.robot), *shape_doubts(drafted.robot)]
-        if fixed := sorted(joint for joint, why in drafted.locked.items() if why == NO_RANGE):
-            causes.append(f"joints without a range, locked: {', '.join(fixed)}")
+        for why, what in ((NO_RANGE, "without a range"), (FIXED, FIXED)):
+            if names := sorted(joint for joint, reason in drafted.locked.items() if reason == why):
+                causes.append(f"joints {what}, locked: {', '.join(names)}")
         if not causes:
             raise
         raise InputError("; ".join([*causes, str(error)])) from error
@@ -390,7 +391,8 @@ def _kick(
     """
     if any(sole.hinge is not None for sole in soles):
         raise InputError(
-            f"{drafted.path}: legs of five joints cannot kick: a foot in the air would swing on its hinge"
+            f"{drafted.path}: legs of five joints cannot kick: a foot in the air would swing on its hinge; "
+            + ("let it punch" if drafted.arms else "bolt it to the ground (--bolted)")
         )
     lifted = max(range(len(soles)), key=lambda k: soles[k].name == "right")
     foot, stands = soles[lifted], soles[1 - lifted]

@@ -26,6 +26,7 @@ from impactopt.robots.robot import Robot
 from impactopt.robots.urdf import read_urdf
 
 Array = NDArray[np.float64]
+FIXED = "fixed in the file"  # reason for which a joint is locked
 SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may have another dot
 
 
@@ -127,6 +128,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if legs:
         _check_legs(found.robot, legs)
         extra = dict.fromkeys(toes(found.robot.model, legs, found.pieces), "a toe")
+        extra |= dict.fromkeys(_undriven(found, legs, extra), "no motor")
         locked = {**locked, **extra}
         carrying = {str(found.robot.model.names[j]) for leg in legs for j in leg.path} - extra.keys()
         if extra or carrying & found.drives.torque.keys():
@@ -156,6 +158,18 @@ def _coupled_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
             leader = robot.couplings[follower].leader
             if leader not in {names[j] for j in own}:
                 out |= dict.fromkeys((leader, follower), f"{follower} follows {leader}")
+    return out
+
+
+def _undriven(found: Drafted, legs: tuple[Limb, ...], toes: Collection[str]) -> list[str]:
+    """Joints without a torque limit on legs of more than six joints of which others have one, such as Digit's
+    tarsi, which springs and rods hold; without its toes each leg keeps six.
+    """
+    out = list[str]()
+    for own in unshared(found.robot.model, legs):
+        names = [name for j in own if (name := str(found.robot.model.names[j])) not in toes]
+        free = [name for name in names if name in found.drives.torque]
+        out += free[: max(len(names) - LEG, 0)] if len(free) < len(names) else []
     return out
 
 
@@ -239,7 +253,7 @@ def _follows(model: pin.Model, tie: Tie, locked: Collection[str]) -> bool:
 
 def _why_locked(tie: Tie) -> str:
     others = [joint for joint in tie.joints if joint != tie.follower]
-    return f"{tie.follower} follows {others[0]}" if others else f"{tie.follower} is fixed"
+    return f"{tie.follower} follows {others[0]}" if others else FIXED
 
 
 def _made(
@@ -251,7 +265,7 @@ def _made(
         if tie.follower in locked:
             angles[tie.follower] = _followed(read.model, tie, angles)
     model = read.moving(angles)
-    drives = guess_drives(model, read.torque, carrying, read.unranged)
+    drives = guess_drives(model, read.torque, carrying, read.unranged, read.kd)
     wrong: tuple[str, ...] = ()
     try:
         check_inertias(model)
@@ -324,5 +338,5 @@ def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> None:
         raise InputError(
             f"{robot.name!r} has {len(legs)} legs of {counts} joints of their own each ({listed}), and "
             f"impactopt plans for robots on two legs of {LEG} or more, which fix a sole in all its {LEG} "
-            f"directions, on two of {LEG - 1}, whose soles turn about one axis, or on a fixed base"
+            f"directions, on two of {LEG - 1}, whose soles turn about one axis, or on a fixed base (--bolted)"
         )

@@ -52,11 +52,13 @@ def find_striker(
     points = [p.vertices for p in own if not is_far(model, p, own)]
     if own and not points:
         points = [inertia_box(model.inertias[limb.tip]).vertices]
+    # a link without shapes reaches to its centre of mass at least
+    ends = points or [np.array(model.inertias[limb.tip].lever)[None]]
     away, tool = _away(model, limb), _tool(model, limb.tip)
     if tool is not None:
         place = tool.placement
         axes = np.column_stack([place.rotation, -place.rotation])
-        reach = np.max([np.zeros(6), *(((p - place.translation) @ axes).max(axis=0) for p in points)], axis=0)
+        reach = np.max([np.zeros(6), *(((p - place.translation) @ axes).max(axis=0) for p in ends)], axis=0)
         way = place.translation + away * APART
         if np.linalg.norm(way) <= 3 * APART:  # at the joint itself: towards a long hand, else along the arm
             way = axes[:, int(np.argmax(reach))] if reach.max() > LONG else away
@@ -66,8 +68,8 @@ def find_striker(
         return Striker(name=name, frame=str(tool.name), point=np.round(local, 4) + 0.0), axis
     parent, above = first_link(model, limb.tip)
     frames = [f.placement.translation for f in model.frames if f.parentJoint == limb.tip]
-    axis = _axis(model, limb, points, frames, away)
-    everything = np.concatenate([*points, np.array(frames).reshape(-1, 3)])
+    axis = _axis(model, limb, points, frames if points else [*frames, *ends[0]], away)
+    everything = np.concatenate([*ends, np.array(frames).reshape(-1, 3)])
     point = axis * max(float((everything @ axis).max()), 0.0)
     return Striker(name=name, frame=parent, point=np.round(above.actInv(point), 4) + 0.0), axis
 

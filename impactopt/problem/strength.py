@@ -19,6 +19,7 @@ from impactopt.contact.targets import FreeMass, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.terms import FirstTouch, HandOrientation, TorqueLimit
+from impactopt.problem.terms.first_touch import face_of
 from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 
@@ -233,30 +234,34 @@ def drawn_impacts(
 def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
     """Posture at contact (nq,) for the initial guess of a motion.
 
-    seed : that of `drawn_posture`; with 0, of the first start, it is the problem's `contact_posture` if the
-        hand has its orientation there.
+    seed : that of `drawn_posture`; with 0, of the first start, it is the problem's `contact_posture` if that
+        does not violate `HandOrientation`.
     """
     posture = problem.contact_posture
-    return posture if not seed and _faces(problem, posture) else drawn_posture(problem, seed)
+    faces = _faces(problem, posture, _hand_facing(problem))
+    return posture if faces and not seed else drawn_posture(problem, seed)
 
 
 def drawn_posture(problem: ImpactProblem, seed: int = 0) -> Array:
     """Strongest posture at contact (nq,) that inverse kinematics finds from `ATTEMPTS` random postures.
 
-    Of the results that have the hand's orientation without penetration, the posture with the largest
-    estimated impulse is taken, decreased with the time that the joints need from the start posture. It is the
-    `contact_posture` if there is none, and of robots on soles or with two striking points.
+    Of the results that have the hand's orientation, or else its face to the target, without penetration, the
+    posture with the largest estimated impulse is taken, decreased with the time that the joints need from the
+    start posture. It is the `contact_posture` if there is none, and of robots on soles or with two striking
+    points.
     """
     p, robot = problem, problem.robot
     best, chosen = 0.0, p.contact_posture
     if robot.floating or p.second is not None:
         return chosen
+    facing = _hand_facing(p) or _face_facing(p)
     strength = Strength(robot=robot, striker=p.striker, law=p.law, target=p.target)
     start = robot.joint_positions(p.start_posture)
     for guess in random_postures(robot, p.striker, p.start_posture, ATTEMPTS, seed):
         with suppress(InputError):
-            q = inverse_kinematics(p.coordinates, p.striker, p.point, guess, facing=_facing(p), starts=1)
-            if not _faces(p, q) or (p.keeps_apart and touches(p, q)):
+            lines = None if facing is None else facing[:2]
+            q = inverse_kinematics(p.coordinates, p.striker, p.point, guess, facing=lines, starts=1)
+            if not _faces(p, q, facing) or (p.keeps_apart and touches(p, q)):
                 continue
             needed = float(np.max(np.abs(robot.joint_positions(q) - start) / robot.velocity_limit))
             decay = np.exp(-DECAY * needed / p.swing.duration[1])
@@ -268,23 +273,38 @@ def drawn_posture(problem: ImpactProblem, seed: int = 0) -> Array:
     return chosen
 
 
-def _facing(problem: ImpactProblem) -> tuple[Array, Array] | None:
-    """Axis of the striker's frame and the direction in the world (3,) that `HandOrientation` requires."""
+# axis of the striker's frame (3,), direction in the world (3,), and the largest angle between them [rad]
+_Facing = tuple[Array, Array, float]
+
+
+def _hand_facing(problem: ImpactProblem) -> _Facing | None:
+    """Orientation that `HandOrientation` requires."""
     hand = problem.extra(HandOrientation)
     if hand is None:
         return None
-    return np.array(hand.axis), problem.normal if hand.direction is None else np.array(hand.direction)
+    return (
+        np.array(hand.axis),
+        np.array(problem.normal if hand.direction is None else hand.direction),
+        hand.angle,
+    )
 
 
-def _faces(problem: ImpactProblem, q: Array) -> bool:
-    """True if a configuration (nq,) has the hand's orientation, or none is required."""
-    hand, facing = problem.extra(HandOrientation), _facing(problem)
-    if hand is None or facing is None:
+def _face_facing(problem: ImpactProblem) -> _Facing | None:
+    """Orientation that `FirstTouch` requires of a striker with a known shape."""
+    touch = problem.term(FirstTouch)
+    face = face_of(problem, problem.striker) if touch.enabled else None
+    return None if face is None else (face.normal, problem.normal, touch.angle)
+
+
+def _faces(problem: ImpactProblem, q: Array, facing: _Facing | None) -> bool:
+    """True if the striker has an orientation in a configuration (nq,), or needs none."""
+    if facing is None:
         return True
-    model, data = problem.robot.model, problem.robot.model.createData()
-    frame = model.getFrameId(problem.robot.striker(problem.striker).model_frame)
+    (axis, direction, angle), robot = facing, problem.robot
+    model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, q)
-    return bool((data.oMf[frame].rotation @ facing[0]) @ facing[1] >= np.cos(hand.angle))
+    at = data.oMf[model.getFrameId(robot.striker(problem.striker).model_frame)]
+    return bool((at.rotation @ axis) @ direction >= np.cos(angle))
 
 
 def drawn_ranges(robot: Robot) -> tuple[Array, Array]:

@@ -169,7 +169,7 @@ def test_sweeps_of_the_package_go_by_name(tmp_path: Path, monkeypatch: pytest.Mo
     listed = r"no sweep 'colision_target' .did you mean 'collision_target'.*collision_million.*path of a file"
     with pytest.raises(InputError, match=listed):
         read_sweep_file("colision_target")
-    with pytest.raises(InputError, match=r"cannot read collision_target\.toml: No such file"):
+    with pytest.raises(InputError, match=r"no file collision_target\.toml here.*sweep is named"):
         read_sweep_file("collision_target.toml")
 
 

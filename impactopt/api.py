@@ -199,11 +199,11 @@ def load_solution(
     """The solution that `impactopt solve` saved: to plot, validate, change, export or start from.
 
     It has no history of the iterations. If the package makes another program of the problem today, that is
-    solved again from the saved variables.
+    solved again, from the saved motion if it has as many variables.
 
     result : its directory, or its `solution.npz`.
     problem_file : used instead of the saved text, such as when the problem's URDF has moved; another problem
-        is solved from the saved variables.
+        is solved in the same way.
 
     Raises
     ------

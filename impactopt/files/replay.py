@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.util
 import json
@@ -41,18 +42,23 @@ def resumed(record: Record, problem: ImpactProblem, *, other: bool = False) -> S
     """The solution of a record, for a warm start; without the history of its solve.
 
     The program is rebuilt from its description in the record. If there is none, or the program differs today,
-    the problem is solved again, with the record's variables as the initial guess if their number is the same.
+    the problem is solved again, from the record's solution if the number of variables is the same.
 
     problem : the record's, as `impactopt.files.replay.load_planned` builds it.
     other : it is not the record's, and solved again: the record may meet its constraints, and be no optimum.
     """
-    made = program_of_record(record, problem)
-    x = np.asarray(record.arrays["solver_x"])
+    x, made = np.asarray(record.arrays["solver_x"]), None
+    with contextlib.suppress(ValueError, LookupError):  # of other bodies, stances or phases
+        made = program_of_record(record, problem)
     if made is not None and not other and _same_program(made, record):
         return solution_of_record(record, made)
     if made is None or made.program.n != len(x):
         return solve(problem)
-    return solve(problem, start=x)
+    arrays = dict(record.arrays)
+    if len(arrays["solver_multipliers"]) != made.program.m:
+        arrays["solver_multipliers"] = np.zeros(made.program.m)
+    # A solution, not its variables: these are of the record's mesh.
+    return solve(problem, start=solution_of_record(dataclasses.replace(record, arrays=arrays), made))
 
 
 def program_of_record(record: Record, problem: ImpactProblem) -> Transcription | None:
@@ -224,6 +230,11 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
     try:
         problem = file.build()
         gains = record.summary.get("gains", ())
+        if problem.gains and len(gains) != len(problem.gains):
+            raise InputError(
+                f"factors of [[robot.gains]] are ranges, of which the plan in {result} has not chosen: give "
+                "numbers in place of the ranges"
+            )
         problem = with_chosen(problem, [each["factor"] for each in gains])
         if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
             problem = replace(problem, price_scale=scale)

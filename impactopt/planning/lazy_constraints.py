@@ -110,20 +110,22 @@ def reference_beyond(term: ReferenceRange, plan: Plan) -> str:
     return f"the servo's reference of {robot.joint_names[k]} coasts {beyond[k]:.3f} rad beyond its range"
 
 
-def slide_caution(length: float) -> str:
+def slide_caution(problem: ImpactProblem, length: float) -> str:
     """Warning about a slide of this length [m]; "" if it is short."""
     if length <= FAR:
         return ""
+    remedy = "a smaller most_m" if problem.term(Slide).enabled else "enabled = true"
     return (
         f"The striking point slides {1e3 * length:.0f} mm across the target. "
-        f"In replays the face ends {1e3 * FACE:.0f} mm from the hit point; a smaller most_m in "
-        "[terms.slide] keeps it nearer."
+        f"In replays the face ends {1e3 * FACE:.0f} mm from the hit point"
+        # Two strikers have no such term.
+        + (f"; {remedy} in [terms.slide] keeps it nearer." if problem.second is None else ".")
     )
 
 
 def meets_again(problem: ImpactProblem, plan: Plan) -> str:
     """Warning about a striking point that reaches the target again in the follow-through, such as a slow one;
-    "" without. A target that stays, or whose speed is bounded, has constraints for it.
+    "" without. The target keeps its last speed. One that stays, or whose speed is bounded, has constraints.
     """
     if problem.target.stays or not problem.lasts or problem.extra(TargetSpeed) is not None:
         return ""

@@ -196,12 +196,12 @@ class Outcome(Generic[Program]):
         result = one_after_the_other(self.result, new.result)
         return replace(new, result=result, origin=self.origin, attempts=attempts)
 
-    def else_then(self, new: Outcome[Program]) -> Outcome[Program]:
+    def else_then(self, new: Outcome[Program], name: str = "") -> Outcome[Program]:
         """New outcome after a failure; this one if the new one has failed with a larger violation. Either has
-        the effort of both.
+        the effort of both; ``name``: of the new one's attempt.
         """
         # An interruption ends the work: its result is the latest, whatever its rank.
-        both, ended = self.then(new), new.usable or new.result.status is Status.INTERRUPTED
+        both, ended = self.then(new, name), new.usable or new.result.status is Status.INTERRUPTED
         if ended or not rank_of(self.result) < rank_of(new.result):
             return both
         return replace(self, result=with_effort_of(self.result, both.result))

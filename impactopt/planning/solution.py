@@ -325,7 +325,7 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        slides, again = slide_caution(self.slide), meets_again(self.problem, plan)
+        slides, again = slide_caution(self.problem, self.slide), meets_again(self.problem, plan)
         cautions = (out.get("caution"), again, slides, self.window, overlapping(self.problem))
         if caution := " ".join(filter(None, cautions)):
             out["caution"] = caution

@@ -322,7 +322,8 @@ def _best(
     if result.status is not Status.ITERATION_LIMIT or ended_with_violations(program, result):
         return outcome
     # A motion within all bounds refutes the estimate: it gets the iterations that are left.
-    return outcome.else_then(solver.from_guess(Guess(program=program, start=result)))
+    more = solver.from_guess(Guess(program=program, start=result))
+    return outcome.else_then(more, "more iterations")
 
 
 def _else_from_other_posture(
@@ -339,7 +340,7 @@ def _else_from_other_posture(
         if not np.array_equal(posture, used):
             solver.budget.say("no motion was found: solving again from another posture at contact")
             guess = Guess(program=t, start=first_iterate(t, posture=posture))
-            return outcome.else_then(solver.from_guess(guess))
+            return outcome.else_then(solver.from_guess(guess), "other posture")
     return outcome
 
 

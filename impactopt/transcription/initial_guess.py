@@ -111,7 +111,7 @@ def reached(
     y = np.clip(y, limits.y_lower, limits.y_upper)
     if down := _descent(c, y, _GUESSED_EXTENSION * limits.extension.minimum) if c.soles else 0.0:
         y[2] -= down
-        legs = c.solve_legs(y, legs)
+        legs = c.solve_legs(y, c.start_legs)  # those of the posture may bend the other way
     bounds = p.extra(TargetSpeed)
     if p.order or bounds is not None:
         mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]

@@ -28,6 +28,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from impactopt import (
+    FreeMass,
     InputError,
     RigidWall,
     Solution,
@@ -38,10 +39,11 @@ from impactopt import (
     load_solution,
     moved_solution,
     solve,
+    write_problem,
 )
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
-from impactopt.files.replay import problem_of, resumed
+from impactopt.files.replay import load_planned, problem_of, resumed
 from impactopt.live import plan_page as look_module
 from impactopt.live.drawing import moment_of
 from impactopt.live.plan_page import PlanPage, plan_message
@@ -304,6 +306,35 @@ def test_a_result_under_another_problem_is_solved_for_that(
     again = load_solution(saved, problem_file=other)
     assert again.status.usable
     assert again.objectives["target energy"] > 1.001 * worth
+
+
+@pytest.mark.slow
+def test_a_refined_result_is_solved_for_another_problem(arm: Solution, tmp_path: Path) -> None:
+    """Its variables are more than those of the problem's first mesh, and the nail's bodies are others."""
+    problem = dataclasses.replace(
+        arm.problem,
+        target=FreeMass(mass=2.0),
+        law=SpringDamper(stiffness=1e5, damping=100.0),
+        collision_stages=2,
+        collision_elements=((1.0,), (1.0,)),
+    )
+    finer, other = solve(problem), dataclasses.replace(problem, target=FreeMass(mass=3.0))
+    assert finer.elements
+    (tmp_path / "other.toml").write_text(write_problem(other), encoding="utf-8")
+    result = finer.save(tmp_path / "result")
+    again = load_solution(result, problem_file=tmp_path / "other.toml")
+    assert again.status.usable
+    assert again.impulse == pytest.approx(solve(other).impulse, rel=1e-4)
+    nailing = load_solution(result, problem_file=FILE)
+    assert nailing.status.usable and nailing.impulse == pytest.approx(arm.impulse, rel=1e-3)
+
+
+def test_a_plan_without_chosen_gains_has_none_for_open_ones(saved: Path, tmp_path: Path) -> None:
+    text = FILE.read_text(encoding="utf-8").replace('robot = "planar_arm"', "")
+    gains = '[robot]\npreset = "planar_arm"\n[[robot.gains]]\njoints = ["*"]\nfactor = [0.7, 1.3]\n'
+    (tmp_path / "open.toml").write_text(f"{text}\n{gains}", encoding="utf-8")
+    with pytest.raises(InputError, match=r"\[\[robot\.gains\]\] are ranges.*give numbers"):
+        load_planned(saved, problem_file=tmp_path / "open.toml")
 
 
 @pytest.mark.parametrize("without", ["program_statement", "solver_x"])

@@ -34,7 +34,7 @@ from impactopt.planning.diagnosis import with_reason
 from impactopt.report.histories import soles_standing, zmp_margins
 from impactopt.simulation import ControllerSettings, Simulation, scene_of, simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.transcription.initial_guess import first_iterate, warm_start
+from impactopt.transcription.initial_guess import first_iterate, reached, warm_start
 from impactopt.transcription.mesh import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.transcription.transcription import Transcription
 
@@ -121,6 +121,16 @@ def test_an_initial_guess_has_no_straight_leg_at_contact() -> None:
     values = t.program.constraints(first_iterate(t))
     worst = np.maximum(t.program.g_lower - values, values - t.program.g_upper).max()
     assert worst < 10  # 5800 with the straight leg
+
+
+@pytest.mark.slow
+def test_a_leg_of_an_initial_guess_bends_as_at_the_start() -> None:
+    """The contact posture has the knee of the standing leg just behind the straight leg."""
+    problem = load_problem("kick_g1")
+    problem = dataclasses.replace(problem, point=problem.point + np.array([-0.1, 0.0, 0.44]))
+    c = problem.coordinates
+    assert c.leg_extension(c.split(problem.contact_posture)[1]).min() < 0
+    assert c.leg_extension(reached(transcribed(problem)).legs).min() > 0
 
 
 def test_effort_after_a_stance_phase_has_the_first_node_of_the_swing() -> None:

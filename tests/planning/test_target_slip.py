@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -71,9 +70,15 @@ def test_a_bound_keeps_it_short(plan: Plan) -> None:
 
 
 def test_only_a_long_slide_is_told() -> None:
-    assert slide_caution(FAR) == ""
-    # the term is on by default, and in drafts: to name it alone would be no advice
-    assert re.search(r"slides 201 mm.*a smaller most_m in \[terms\.slide\]", slide_caution(0.201))
+    """The term is on by default, and in drafts: to name it alone would be no advice."""
+    problem, two = arm_problem(), load_problem("push_two_hands")
+    off = replace(problem, terms=(*problem.terms, Slide(enabled=False)))
+    assert slide_caution(problem, FAR) == ""
+    told = [slide_caution(p, 0.201) for p in (problem, off, two)]
+    assert all("slides 201 mm" in text for text in told)
+    assert "a smaller most_m in [terms.slide]" in told[0]
+    assert "enabled = true in [terms.slide]" in told[1]
+    assert "terms.slide" not in told[2]  # which is refused: it is for one striker
 
 
 @pytest.mark.slow

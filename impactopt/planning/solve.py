@@ -336,12 +336,14 @@ def _else_from_other_posture(
     nearest to the start, where an arm bends the other way.
     """
     p, used = t.problem, strongest_posture(t.problem)
-    for posture in (p.contact_posture, drawn_posture(p)):
-        if not np.array_equal(posture, used):
-            solver.budget.say("no motion was found: solving again from another posture at contact")
-            guess = Guess(program=t, start=first_iterate(t, posture=posture))
-            return outcome.else_then(solver.from_guess(guess), "other posture")
-    return outcome
+    posture = p.contact_posture
+    if np.array_equal(posture, used):
+        posture = drawn_posture(p)
+    if np.array_equal(posture, used):
+        return outcome
+    solver.budget.say("no motion was found: solving again from another posture at contact")
+    guess = Guess(program=t, start=first_iterate(t, posture=posture))
+    return outcome.else_then(solver.from_guess(guess), "other posture")
 
 
 def _diagnosed(

@@ -154,7 +154,7 @@ class Strength:
         stiffness = float(self.law.force(STIFFNESS_DEPTH, 0.0)) / STIFFNESS_DEPTH
         damping = float(self.law.force(STIFFNESS_DEPTH, 1.0)) - float(self.law.force(STIFFNESS_DEPTH, 0.0))
         # [N] peak at 1 m/s, of the spring or the damper alone
-        force = np.maximum(np.sqrt(stiffness * mass), damping)
+        force = np.maximum(np.sqrt(stiffness * mass), max(damping, 1e-12))  # a law may begin deeper
         size = np.maximum(np.abs(jumps), 1e-12)
         gears = robot.gear_limit * robot.torque_limit / np.maximum(robot.armature * size, 1e-12)
         return np.asarray(gears.min(axis=-1) / force)

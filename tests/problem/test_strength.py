@@ -6,12 +6,23 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
 from support import urdfs
 
-from impactopt import FirstTouch, FreeMass, HandOrientation, Robot, SpringDamper, Striker, load_problem, solve
+from impactopt import (
+    CustomLaw,
+    FirstTouch,
+    FreeMass,
+    HandOrientation,
+    Robot,
+    SpringDamper,
+    Striker,
+    load_problem,
+    solve,
+)
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import (
@@ -74,6 +85,14 @@ def test_further_starts_have_other_postures() -> None:
         assert np.abs(one - other).max() > 0.1
     for q in postures:
         assert _off(problem, q)[0] < 1e-6
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_law_without_force_at_first_has_postures() -> None:
+    """Its stiffness was a divisor."""
+    soft = CustomLaw(compression=lambda depth, _: 1e5 * ca.fmax(depth - 2e-3, 0.0))
+    q = strongest_posture(replace(_aside(), law=soft), 1)
+    assert _off(_aside(), q)[0] < 1e-6
 
 
 @pytest.mark.slow

@@ -456,6 +456,14 @@ def test_a_joint_without_a_motor_in_a_leg_of_seven_is_locked(tmp_path: Path) -> 
     problem.robot.check_stance(problem.start_posture, tilt=1e-5)
 
 
+def test_a_knee_whose_torque_is_not_believed_has_a_motor(tmp_path: Path) -> None:
+    """It was locked in a leg of seven, as one without a motor, and nothing was said of its limit."""
+    text = re.sub(r'(<joint name="\w+_knee".*?effort=")[^"]*', r"\g<1>20000", urdfs.biped(legs=7), flags=re.S)
+    drafted = _robot(tmp_path, text)
+    assert drafted.locked == {} and set(drafted.drives.torque) == {"left_knee", "right_knee"}
+    assert "torque limit of left_knee, 20000 N m: hard to believe, and guessed" in drafted.drives.said
+
+
 @pytest.mark.parametrize("spine", [True, False], ids=["spine", "torso"])
 def test_arms_that_hang_from_a_spine_or_end_in_wrists_are_no_legs(tmp_path: Path, spine: bool) -> None:
     parts = [urdfs.link("chest", 5.0, (0.2, 0.3, 0.2), (0.0, 0.0, 0.1))]

@@ -661,9 +661,8 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
         ("position_limit_rad", "position limits"),
     ):
         if key in data["robot"]:
-            count = len(data["robot"][key])
-            kind, joints = robot_kind(drafted), counted(count, "joint")
-            yield f"guessed, as the {kind} has no plausible ones: {what} of {joints}"
+            of = f"{what} of {counted(len(data['robot'][key]), 'joint')}"
+            yield f"guessed, as the {robot_kind(drafted)} has no plausible ones: {of}"
     if guessed := int(_guessed_gains(robot).sum()):
         yield (
             f"guessed: servo gains of {counted(guessed, 'joint')}, kd = 1.5 s x torque limit, at most 150, "

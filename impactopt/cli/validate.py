@@ -132,9 +132,8 @@ def validate(
                 written.append(save_animation(done, animation))
         other = ""
         if problem is not None and planned.of_other_problem:
-            other = (
-                f"{problem} is not the problem of this plan: it is replayed with its robot, target and law"
-            )
+            given = f"{problem}{' with --set' if changes else ''}"
+            other = f"{given} is not the problem of this plan: it is replayed with its robot, target and law"
         if as_json:
             print_json(done.report | ({"caution": other} if other else {}), ok)
         else:

@@ -65,7 +65,10 @@ def _file(name: str | os.PathLike[str], named: Mapping[str, Path], kind: str) ->
         ) from None
     if path.suffix or len(path.parts) != 1 or is_plain_file(path):
         if str(path) == f"{path.stem}.toml" and path.stem in named and not path.exists():
-            raise InputError(f"there is no file {path} here; the package's {kind} is named {path.stem!r}")
+            raise InputError(
+                f"there is no file {path} here; the package's {kind} is named {path.stem!r}, and is the file "
+                f"{named[path.stem]}"
+            )
         return path
     if path.name not in named:
         raise InputError(

@@ -229,13 +229,13 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
     """
     try:
         problem = file.build()
-        gains = record.summary.get("gains", ())
-        if problem.gains and len(gains) != len(problem.gains):
-            raise InputError(
-                f"factors of [[robot.gains]] are ranges, of which the plan in {result} has not chosen: give "
-                "numbers in place of the ranges"
-            )
-        problem = with_chosen(problem, [each["factor"] for each in gains])
+        gains, names = record.summary.get("gains", ()), problem.robot.joint_names
+        opened = zip(problem.gain_joints, problem.gains, strict=True)
+        # another problem may open other gains, which are not those that the plan has chosen
+        if [([names[k] for k in joints], [*gain.factor]) for joints, gain in opened] == [
+            ([*each["joints"]], [*each["between"]]) for each in gains
+        ]:
+            problem = with_chosen(problem, [each["factor"] for each in gains])
         if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
             problem = replace(problem, price_scale=scale)
         if problem.collision == "auto":

@@ -321,9 +321,6 @@ def compile_mjcf(path: str | PathLike[str]) -> Any:
     except (OSError, ValueError) as error:
         whole = _including(Path(file))
         fix = f"; {whole} includes this file: give that one" if whole else ""
-        with contextlib.suppress(OSError, ElementTree.ParseError):
-            if ElementTree.parse(file).getroot().tag == "robot":
-                fix = "; it is a URDF: give it by --urdf, or `urdf` in [robot]"
         raise InputError(f"MJCF {file}: {error}{fix}") from error
 
 
@@ -331,6 +328,9 @@ def compile_mjcf(path: str | PathLike[str]) -> Any:
 def _compiled(file: str, _sources: frozenset[tuple[Path, object]]) -> Any:
     import mujoco
 
+    with contextlib.suppress(ElementTree.ParseError):  # MuJoCo reads a URDF too, without its speed limits
+        if ElementTree.parse(file).getroot().tag == "robot":
+            raise ValueError("it is a URDF: give it by --urdf, or `urdf` in [robot]")
     return mujoco.MjModel.from_xml_path(file)
 
 

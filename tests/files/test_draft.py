@@ -456,6 +456,14 @@ def test_a_joint_without_a_motor_in_a_leg_of_seven_is_locked(tmp_path: Path) -> 
     problem.robot.check_stance(problem.start_posture, tilt=1e-5)
 
 
+def test_a_knee_whose_torque_is_not_believed_has_a_motor(tmp_path: Path) -> None:
+    """It was locked in a leg of seven, as one without a motor, and nothing was said of its limit."""
+    text = re.sub(r'(<joint name="\w+_knee".*?effort=")[^"]*', r"\g<1>20000", urdfs.biped(legs=7), flags=re.S)
+    drafted = _robot(tmp_path, text)
+    assert drafted.locked == {} and set(drafted.drives.torque) == {"left_knee", "right_knee"}
+    assert "torque limit of left_knee, 20000 N m: hard to believe, and guessed" in drafted.drives.said
+
+
 @pytest.mark.parametrize("spine", [True, False], ids=["spine", "torso"])
 def test_arms_that_hang_from_a_spine_or_end_in_wrists_are_no_legs(tmp_path: Path, spine: bool) -> None:
     parts = [urdfs.link("chest", 5.0, (0.2, 0.3, 0.2), (0.0, 0.0, 0.1))]
@@ -829,6 +837,14 @@ def test_the_torque_of_an_excavator_in_an_arm_is_not_believed(tmp_path: Path) ->
     assert "torque limit of shoulder, 50000 N m: hard to believe, and guessed" in found.said
 
 
+@pytest.mark.slow
+def test_a_draft_does_not_say_that_a_file_lacks_limits_which_it_does_not_believe(tmp_path: Path) -> None:
+    (tmp_path / "robot.urdf").write_text(urdfs.arm(effort=5e4))
+    draft = draft_problem(tmp_path / "robot.urdf", folder=tmp_path, planned=False)
+    assert "guessed, as the URDF has no plausible ones: torque limits of 4 joints" in draft.said
+    assert "the file has no plausible one\n[robot.torque_limit_N_m]" in draft.text
+
+
 def test_a_guessed_rotor_bears_the_servo_of_the_file(tmp_path: Path) -> None:
     """An MJCF with stiff servos, and neither torque limits nor armature, as of an iiwa 14, was refused."""
     pytest.importorskip("mujoco")
@@ -862,7 +878,7 @@ def test_joints_of_a_file_without_ranges_get_some(tmp_path: Path) -> None:
     assert count == 4
     draft = _drafted(tmp_path, text)
     problem = _problem(tmp_path, text)
-    assert "guessed, as the URDF has none: position limits of 4 joints" in draft.said
+    assert "guessed, as the URDF has no plausible ones: position limits of 4 joints" in draft.said
     assert problem.robot.n == 4 and (problem.robot.upper > 3.1).all() and (problem.robot.lower < -3.1).all()
     for wrist in ("", 'lower="0" upper="0"'):
         fixed = _robot(tmp_path, arm.replace('lower="-2.0" upper="2.0"', wrist))

@@ -868,6 +868,10 @@ def test_pictures_and_replays_under_another_problem_tell_it(
         assert ("is not the problem of this plan" in page.read_text(encoding="utf-8")) == told
         done = runner.invoke(app, ["validate", str(plan), "--problem", str(file), "--json"])
         assert ("caution" in json.loads(done.stdout)) == told
+    # the plan's file with another value
+    given = ["--problem", str(files[0][0]), "--set", "target.mass_kg=0.06"]
+    done = runner.invoke(app, ["validate", "-q", str(plan), *given], env={"COLUMNS": "200"})
+    assert "arm_planar.toml with --set is not the problem of this plan" in " ".join(done.stdout.split())
 
 
 def test_the_command_knows_all_formats() -> None:

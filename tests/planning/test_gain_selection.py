@@ -185,6 +185,22 @@ def test_a_solution_is_saved_with_the_gains_that_it_has_chosen(tmp_path: Path) -
 
 
 @pytest.mark.slow
+def test_another_problem_chooses_gains_of_its_own(tmp_path: Path) -> None:
+    """It was taken for the plan's, with gains beyond its range; two open gains for one were a traceback."""
+    arm, saved, file = load_problem("arm_planar"), tmp_path / "saved", tmp_path / "other.toml"
+    solution = solve(replace(arm, gains=_open("*", between=(0.7, 0.8))), refine=False)
+    solution.save(saved)
+    for gains in (
+        _open("*", between=(0.9, 1.1)),
+        (*_open("shoulder", between=(0.9, 1.1)), *_open("elbow", between=(0.9, 1.1))),
+    ):
+        file.write_text(write_problem(replace(arm, gains=gains)), encoding="utf-8")
+        found = load_solution(saved, problem_file=file)
+        assert found.status.usable
+        assert [0.9 <= one.factor <= 1.1 for one in found.gains] == [True] * len(gains)
+
+
+@pytest.mark.slow
 def test_gains_of_servos_are_chosen_too() -> None:
     """A strike that may choose is better than the one that it starts from, which may not."""
     arm = load_problem("arm7")

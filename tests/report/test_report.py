@@ -214,16 +214,25 @@ def test_a_strikes_page_has_its_numbers_and_says_what_it_is(record: Record) -> N
 
 @pytest.mark.slow
 def test_a_door_hides_the_robot_from_no_side_of_a_sheet() -> None:
-    """It covered the robot in the front view until it had moved away."""
-    orange, shown = np.array(to_rgb(ORANGE)), dict[float, list[bool]]()
-    for width in (0.18, 0.9):  # a box, a door
-        problem = still_problem(body=TargetBody(size=(width, 2 * width, 0.04)))
-        drawn = sheet(record_of(still_solution(problem=problem)), problem)
-        faces = [np.asarray(axes.collections[0].get_facecolor())[:, :3] for axes in drawn.axes[::7]]
+    """It covered the robot in the front view until it had moved away, or in the view from its side."""
+    orange = np.array(to_rgb(ORANGE))
+    record = record_of(still_solution(problem=still_problem()))
+    ahead, right, everywhere = (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), [True, True, True]
+    for width, normal, seen in (  # a box, and a door ahead, on the right, on the left
+        (0.18, ahead, everywhere),
+        (0.9, ahead, [False, True, True]),
+        (0.9, right, [True, False, True]),
+        (0.9, (0.0, 1.0, 0.0), everywhere),
+    ):
+        problem = still_problem(normal=normal, body=TargetBody(size=(width, 2 * width, 0.04)))
+        faces = [
+            np.asarray(axes.collections[0].get_facecolor())[:, :3]
+            for axes in sheet(record, problem).axes[::7]
+        ]
         # faces are shaded: their colours are along the target's
         along = [colours / np.linalg.norm(colours, axis=1, keepdims=True) for colours in faces]
-        shown[width] = [bool((row @ orange / np.linalg.norm(orange) > 0.9999).any()) for row in along]
-    assert shown == {0.18: [True, True, True], 0.9: [False, True, True]}
+        shown = [bool((row @ orange / np.linalg.norm(orange) > 0.9999).any()) for row in along]
+        assert shown == seen, (width, normal)
 
 
 # ---- in a browser

@@ -464,10 +464,11 @@ def test_a_urdf_and_an_mjcf_that_are_taken_for_each_other_are_told(tmp_path: Pat
     (tmp_path / "arm.xml").write_text("<mujoco><worldbody/></mujoco>")
     with pytest.raises(InputError, match=r"its first element is <mujoco>, not <robot>.*--mjcf"):
         Robot.from_urdf(tmp_path / "arm.xml")
-    mesh = '<collision><geometry><mesh filename="package://arm/a.stl"/></geometry></collision>'
-    (tmp_path / "arm.urdf").write_text(f'<robot name="arm"><link name="base">{mesh}</link></robot>')
-    with pytest.raises(InputError, match=r"it is a URDF: give it by --urdf"):
-        Robot.from_mjcf(tmp_path / "arm.urdf")
+    for shape in ('<mesh filename="package://a.stl"/>', '<sphere radius="0.1"/>'):  # MuJoCo reads the sphere
+        link = f'<link name="base"><collision><geometry>{shape}</geometry></collision></link>'
+        (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{link}</robot>')
+        with pytest.raises(InputError, match=r"it is a URDF: give it by --urdf"):
+            Robot.from_mjcf(tmp_path / "arm.urdf")
 
 
 def test_a_problem_file_can_name_an_mjcf(tree: Path) -> None:

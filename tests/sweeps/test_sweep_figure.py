@@ -132,6 +132,11 @@ def test_a_logarithmic_colour_leaves_out_what_has_no_logarithm() -> None:
     )
     (told,) = (text.get_text() for text in drawn.legends[0].get_texts())
     assert told == "no result: elbow would be beyond its limit; energy of 0 or less, which has no logarithm"
+    # without any logarithm the colours are linear, and nothing is left out
+    columns["energy_J"] = [0.0, -1.0, -1.0, -10.0, -5.0, -2.0]
+    drawn = picture(columns, kind="heatmap", x=SPEED, y=MASS, colour="energy_J", log=["colour"])
+    (told,) = (text.get_text() for text in drawn.legends[0].get_texts())
+    assert told == "no result: elbow would be beyond its limit"
 
 
 def test_a_reason_that_differs_in_its_details_alone_is_told_once() -> None:

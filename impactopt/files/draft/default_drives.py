@@ -43,6 +43,7 @@ class Drives:
     """Guesses by joint: armature [kg m2], torque [N m], velocity [rad/s] and position [rad] limits that the
     file lacks, or that are too large to be meant. Of prismatic joints [kg], [N], [m/s] and [m].
 
+    undriven : joints of which the file has no torque limit.
     said : messages about implausible numbers of the file.
     """
 
@@ -50,6 +51,7 @@ class Drives:
     torque: dict[str, float] = field(default_factory=dict)
     velocity: dict[str, float] = field(default_factory=dict)
     position: dict[str, tuple[float, float]] = field(default_factory=dict)
+    undriven: list[str] = field(default_factory=list)
     said: list[str] = field(default_factory=list)
 
 
@@ -82,6 +84,7 @@ def guess_drives(
         if not 0 < limit < max(LARGEST_TORQUE[revolute], LARGEST_FACTOR * heavy):
             least = max(MIN_TORQUE[revolute], leg_torque * (joint in carrying))
             out.torque[joint] = limit = _rounded(max(GRAVITY_FACTOR * gravity[k], least))
+            out.undriven += [] if 0 < given < UNLIMITED else [joint]
         if max(PLAUSIBLE_TORQUE[revolute], PLAUSIBLE_FACTOR * heavy) < given < UNLIMITED:
             guessed = ", and guessed" if joint in out.torque else ""
             out.said.append(f"torque limit of {joint}, {given:g} {effort}: hard to believe{guessed}")

@@ -564,10 +564,11 @@ def _built(data: dict[str, Any], folder: Path) -> ImpactProblem:
 def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
     """Text of the problem file, with comments on guesses."""
     guessed = {
-        "armature_kg_m2": f"{DOUBT}: {1e3 * USUAL_ROTOR:g} g m2 per N m; give rotor inertia x gear^2",
-        "torque_limit_N_m": f"{DOUBT}: from the largest gravity torques; the file has none",
-        "velocity_limit_rad_s": f"{DOUBT}; the file has none",
-        "position_limit_rad": f"{DOUBT}; the file has none",
+        "armature_kg_m2": f"{DOUBT}: {1e3 * USUAL_ROTOR:g} g m2 per N m, or more for the file's servo gains; "
+        "give rotor inertia x gear^2",
+        "torque_limit_N_m": f"{DOUBT}: from the largest gravity torques; the file has no plausible one",
+        "velocity_limit_rad_s": f"{DOUBT}; the file has no plausible one",
+        "position_limit_rad": f"{DOUBT}; the file has no plausible one",
         "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
         "strikers": "found at the ends of the last links' shapes; move them to the striking points",
         "tools": f"{DOUBT}: a peg to be mounted, as the links before it would touch the target first",
@@ -660,8 +661,8 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
         ("position_limit_rad", "position limits"),
     ):
         if key in data["robot"]:
-            count = len(data["robot"][key])
-            yield f"guessed, as the {robot_kind(drafted)} has none: {what} of {counted(count, 'joint')}"
+            of = f"{what} of {counted(len(data['robot'][key]), 'joint')}"
+            yield f"guessed, as the {robot_kind(drafted)} has no plausible ones: {of}"
     if guessed := int(_guessed_gains(robot).sum()):
         yield (
             f"guessed: servo gains of {counted(guessed, 'joint')}, kd = 1.5 s x torque limit, at most 150, "

@@ -168,7 +168,7 @@ def _undriven(found: Drafted, legs: tuple[Limb, ...], toes: Collection[str]) -> 
     out = list[str]()
     for own in unshared(found.robot.model, legs):
         names = [name for j in own if (name := str(found.robot.model.names[j])) not in toes]
-        free = [name for name in names if name in found.drives.torque]
+        free = [name for name in names if name in found.drives.undriven]
         out += free[: max(len(names) - LEG, 0)] if len(free) < len(names) else []
     return out
 

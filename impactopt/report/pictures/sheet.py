@@ -43,7 +43,7 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
     chosen = _chosen(track)
     points = np.array([problem.point, *([] if problem.second is None else [problem.second.point])])
     solids, world = _solids(problem), [p for p in surroundings_of(problem.world) if not _hides(p)]
-    beside = [p for p in world if not _covers(p)]
+    beside = [[p for p in world if not _covers(p, problem.normal, view)] for _, view in VIEWS]
     robots = [_joined([_placed(track, k, solid) for solid in solids]) for k in chosen]
     around = [_around(track, k, world, problem.normal) for k in chosen]
     # a stray vertex of a mesh may lie anywhere
@@ -57,11 +57,9 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
     figure = Picture(WIDTH, scale * sum(heights) + 1.3)
     axes = figure.subplots(len(VIEWS), len(chosen), squeeze=False, gridspec_kw={"height_ratios": heights})
     for column, k in enumerate(chosen):
-        scene = _joined([robots[column], *around[column]])
-        uncovered = _joined([robots[column], *_around(track, k, beside, problem.normal)])
         for row, (name, view) in enumerate(VIEWS):
             ax = axes[row, column]
-            _draw(ax, *(uncovered if name == "front" else scene), view)
+            _draw(ax, *_joined([robots[column], *_around(track, k, beside[row], problem.normal)]), view)
             ax.plot(*(points @ view[:2].T).T, "o", color=VERMILION, markersize=2, zorder=5)
             (left, right), (low, high) = (np.sort(ends @ direction) for direction in view[:2])
             ax.set(xlim=(left, right), ylim=(low, high), aspect="equal")
@@ -91,9 +89,11 @@ def _hides(part: Part) -> bool:
     return part.clear and part.kind != "obstacle"
 
 
-def _covers(part: Part) -> bool:
-    """True if a target would cover the robot from the front, as a door does."""
-    return part.kind == "target" and float(np.ptp(part.solid.vertices, axis=0)[1:].min()) > LARGE
+def _covers(part: Part, normal: Array, view: Array) -> bool:
+    """True if a target would cover the robot in a view, as a door ahead does from the front."""
+    if part.kind != "target" or normal @ view[2] < 0.5:  # else the viewer is behind the target
+        return False
+    return float(np.ptp(part.solid.vertices @ view[:2].T, axis=0).min()) > LARGE
 
 
 def _around(track: Track, k: int, world: list[Part], normal: Array) -> list[Shown]:

@@ -117,12 +117,13 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
         table[j, i] = data.results(name)
         table[~np.isfinite(table)] = np.nan
         axes.set_facecolor(NO_RESULT)
-        if "colour" in section.log and (table <= 0).any():
+        log = "colour" in section.log and bool((table > 0).any())  # else all have linear colours
+        if log and (table <= 0).any():
             grey.append(f"{data.label(name).partition(' [')[0]} of 0 or less, which has no logarithm")
         mesh = axes.pcolormesh(
             _edges(across, "x" in section.log), _edges(up, "y" in section.log),
             np.ma.masked_invalid(table), cmap=SCALE, rasterized=True,
-            norm=LogNorm() if "colour" in section.log and (table > 0).any() else None,
+            norm=LogNorm() if log else None,
         )  # fmt: skip
         axes.grid(visible=False)
         bar = figure.colorbar(mesh, ax=axes, format=_PLAIN)

@@ -333,8 +333,7 @@ def test_a_plan_without_chosen_gains_has_none_for_open_ones(saved: Path, tmp_pat
     text = FILE.read_text(encoding="utf-8").replace('robot = "planar_arm"', "")
     gains = '[robot]\npreset = "planar_arm"\n[[robot.gains]]\njoints = ["*"]\nfactor = [0.7, 1.3]\n'
     (tmp_path / "open.toml").write_text(f"{text}\n{gains}", encoding="utf-8")
-    with pytest.raises(InputError, match=r"\[\[robot\.gains\]\] are ranges.*give numbers"):
-        load_planned(saved, problem_file=tmp_path / "open.toml")
+    assert len(load_planned(saved, problem_file=tmp_path / "open.toml").problem.gains) == 1
 
 
 @pytest.mark.parametrize("without", ["program_statement", "solver_x"])

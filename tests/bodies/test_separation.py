@@ -198,6 +198,7 @@ def test_values_of_trials_do_not_move_the_side_of_an_iterate() -> None:
     assert value(again, first) == before
 
 
+@pytest.mark.slow
 def test_few_vertices_stand_for_many() -> None:
     rng = np.random.default_rng(3)
     ball = rng.standard_normal((2000, 3))

@@ -89,6 +89,7 @@ def test_every_rung_takes_the_same_and_gives_the_same_kind_of_result():
         assert result.velocity.shape == (robot.nv,) and result.configuration.shape == (robot.nq,)
 
 
+@pytest.mark.slow
 def test_each_rung_is_nearer_to_full_dynamics_than_the_one_below():
     robot = small()
     q, v, torque = situation(robot, seed=3, speed=1.5, **FIST)

@@ -148,6 +148,7 @@ def test_random_collisions_are_the_exact_ones(name: str) -> None:
         assert found.duration == pytest.approx(true.duration, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_error_falls_with_the_tolerance() -> None:
     model = dataclasses.replace(model_of("mass"), horizon=0.5)
     tolerances, errors = np.logspace(-3, -9, 4), []

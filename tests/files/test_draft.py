@@ -204,6 +204,7 @@ def test_a_robot_whose_knees_point_back_has_its_right_foot_on_its_right(tmp_path
     assert kick["striker"] == "right_toe" and kick["point_m"][1] < 0
 
 
+@pytest.mark.slow
 def test_a_kick_in_place_of_a_punch_is_told_with_the_reason(tmp_path: Path) -> None:
     text = urdfs.biped()
     for joint, low, high in (("shoulder_pitch", 1.2, 2.8), ("elbow", -0.2, 0.0)):  # arms stay behind
@@ -809,6 +810,7 @@ def test_what_the_file_lacks_is_guessed_and_said_to_be(tmp_path: Path) -> None:
     assert sum("guessed" in line for line in draft.said) == 4  # and the gains
 
 
+@pytest.mark.slow
 def test_motors_that_cannot_hold_the_arm_are_told(tmp_path: Path) -> None:
     """As of files that give each joint the same placeholder."""
     draft = _drafted(tmp_path, urdfs.arm(effort=9.0), planned=True)
@@ -1028,6 +1030,7 @@ def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
     assert {joint for joint, why in locked.items() if why == "drives a base"} == {"x", "y", "yaw"}
 
 
+@pytest.mark.slow
 def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"

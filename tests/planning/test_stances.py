@@ -133,6 +133,7 @@ def test_a_leg_of_an_initial_guess_bends_as_at_the_start() -> None:
     assert c.leg_extension(reached(transcribed(problem)).legs).min() > 0
 
 
+@pytest.mark.slow
 def test_effort_after_a_stance_phase_has_the_first_node_of_the_swing() -> None:
     """The objective's value is the trapezoidal sum of all nodes of swing and follow-through."""
     t = transcribed(stepping(objectives=(Effort(weight=1.0),)))

@@ -113,6 +113,7 @@ def test_constraints_enter_only_when_needed():
     assert all(int(record.note.split("constraints ")[1].split()[0]) < 100 for record in result.history[1:])
 
 
+@pytest.mark.slow
 def test_infeasible_programs_name_the_constraints():
     program, x0 = infeasible()
     for options in WAYS.values():

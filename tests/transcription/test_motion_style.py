@@ -147,6 +147,7 @@ def test_a_robot_at_rest_presses_with_its_weight(biped_plan: Planned) -> None:
     assert low == high == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_weight_is_that_of_the_robots_gravity() -> None:
     """On Mars a robot at rest presses with all of its weight, too."""
     robot = biped()

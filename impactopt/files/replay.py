@@ -222,31 +222,42 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """The problem as the record's plan has it: with its collision model, lazy constraints, order of touches,
-    optimized gains and prices of the style.
+    """The problem as the record's plan has it; of another one, given by the user, as it stands.
 
     given : the file is one given by the user, not the record's own text.
     """
     try:
         problem = file.build()
-        gains, names = record.summary.get("gains", ()), problem.robot.joint_names
-        opened = zip(problem.gain_joints, problem.gains, strict=True)
-        # another problem may open other gains, which are not those that the plan has chosen
-        if [([names[k] for k in joints], [*gain.factor]) for joints, gain in opened] == [
-            ([*each["joints"]], [*each["between"]]) for each in gains
-        ]:
-            problem = with_chosen(problem, [each["factor"] for each in gains])
-        if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
-            problem = replace(problem, price_scale=scale)
         if problem.collision == "auto":
             problem = replace(problem, collision=record.summary.get("collision_model", "full"))
-        if touches := record.summary.get("touches"):
-            problem = replace(problem, touches=tuple(touches) if isinstance(touches, list) else touches)
-        return with_lazy_constraints(problem, record.summary.get("rows_on_demand", ()))
+        if not given:
+            return _as_planned(record, problem)
     except InputError as error:
         if given:
             raise
         raise _cannot_rebuild(result, error) from error
+    # another problem may refuse what the plan has, such as its order of touches, or have no plan with it
+    with contextlib.suppress(InputError):
+        own = _as_planned(record, problem)
+        if own.hash == record.summary.get("problem", {}).get("hash", own.hash):
+            return own
+    return problem
+
+
+def _as_planned(record: Record, problem: ImpactProblem) -> ImpactProblem:
+    """The problem with the lazy constraints, order of touches, optimized gains and prices of a plan."""
+    gains, names = record.summary.get("gains", ()), problem.robot.joint_names
+    opened = zip(problem.gain_joints, problem.gains, strict=True)
+    # another problem may open other gains, which are not those that the plan has chosen
+    if [([names[k] for k in joints], [*gain.factor]) for joints, gain in opened] == [
+        ([*each["joints"]], [*each["between"]]) for each in gains
+    ]:
+        problem = with_chosen(problem, [each["factor"] for each in gains])
+    if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
+        problem = replace(problem, price_scale=scale)
+    if touches := record.summary.get("touches"):
+        problem = replace(problem, touches=tuple(touches) if isinstance(touches, list) else touches)
+    return with_lazy_constraints(problem, record.summary.get("rows_on_demand", ()))
 
 
 def _cannot_rebuild(result: Path, error: InputError) -> InputError:

@@ -29,6 +29,7 @@ from impactopt import (
     solve,
 )
 from impactopt.contact.targets.base import SEPARATION, TOUCH, contact_phases, order_of_touches
+from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
 from impactopt.files.replay import load_planned
 from impactopt.planning.models import largest_force
@@ -501,3 +502,11 @@ def test_what_gears_bear_is_what_they_carry_at_that_force(swung: Solution) -> No
 def test_touches_that_no_plan_has_are_refused(changes: dict[str, Any], why: str) -> None:
     with pytest.raises(InputError, match=why):
         stiff(**changes)
+
+
+def test_another_problem_has_not_the_plans_touches(chopped: Solution, tmp_path: Path) -> None:
+    """A mass was refused for touches that its file does not have, and a soft board had no plan."""
+    result = chopped.save(tmp_path / "chopped")
+    assert load_planned(result).problem.order == chopped.problem.order
+    for name in ("arm_planar", "chop_arm"):
+        assert load_planned(result, problem_file=problem_file(name)).problem.order == ()

@@ -212,8 +212,8 @@ def load_solution(
     from impactopt.files.replay import load_planned, resumed
 
     planned = load_planned(result, problem_file=problem_file)
-    other = problem_file is not None and planned.of_other_problem
-    return cast(Solution, _public(resumed(planned.record, planned.problem, other=other)))
+    again = resumed(planned.record, planned.problem, other=planned.of_other_problem)
+    return cast(Solution, _public(again))
 
 
 def _or_file(run: Callable[..., R]) -> Callable[..., R]:

@@ -81,7 +81,7 @@ def export(
         )
         cost = None if limits is None else json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
         caution = None
-        if problem is not None and planned.of_other_problem:
+        if planned.of_other_problem:
             plans = "motion and what is expected are" if limits is None else "motion is"
             caution = (
                 f"{problem} is not the problem of this plan: gains, limits, target and contact law in the "

@@ -111,7 +111,7 @@ def _sheet(result: Path, problem: Path | None, file: Path) -> None:
 
 def _caution(planned: Planned, problem: Path | None) -> str:
     """Caution about a given problem that is not the plan's; "" if there is none."""
-    if problem is None or not planned.of_other_problem:
+    if not planned.of_other_problem:
         return ""
     return (
         f"{problem} is not the problem of this plan: robot, target, ground and limits are drawn of it, the "
@@ -138,8 +138,8 @@ def _page(what: Path, problem: Path | None, port: int) -> PlanPage | CollisionPa
 
     if not _is_robot(what):
         planned = load_planned(what, problem_file=problem)
-        other = problem is not None and planned.of_other_problem
-        return PlanPage(resumed(planned.record, planned.problem, other=other), port=port)
+        again = resumed(planned.record, planned.problem, other=planned.of_other_problem)
+        return PlanPage(again, port=port)
     if what.suffix != ".toml" or problem is not None:
         raise InputError(f"--live is for a result, or for a problem file alone: {str(what)!r} has no target")
     return CollisionPage(read_problem_file(what).build(), port=port)

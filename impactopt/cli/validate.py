@@ -131,7 +131,7 @@ def validate(
                 make_directory(animation.parent)
                 written.append(save_animation(done, animation))
         other = ""
-        if problem is not None and planned.of_other_problem:
+        if planned.of_other_problem:
             given = f"{problem}{' with --set' if changes else ''}"
             other = f"{given} is not the problem of this plan: it is replayed with its robot, target and law"
         if as_json:

@@ -13,13 +13,14 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
 
 from impactopt.errors import MOST, InputError, check_number, counted
 
+T = TypeVar("T")
 _METADATA = "about"
 
 
@@ -121,6 +122,11 @@ class Described:
 def snake_case(name: str) -> str:
     """Name of a class in files: `TorqueRate` as `torque_rate`."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
+
+
+def in_order(parts: Iterable[T], kinds: Sequence[type]) -> tuple[T, ...]:
+    """Parts of a problem in the order of their classes in files, those of a user's own classes last."""
+    return tuple(sorted(parts, key=lambda p: kinds.index(type(p)) if type(p) in kinds else len(kinds)))
 
 
 Parameters = Mapping[str, Any]

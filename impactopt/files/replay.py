@@ -111,6 +111,8 @@ def solution_of_record(record: Record, t: Transcription) -> Solution:
 class Planned:
     """Input of a replay: a record, its problem, the servo's reference, the reference for a missed target if
     the plan has one, and settings of a whole-body controller.
+
+    given : the problem is of a file that the user gives, not of the record's own text.
     """
 
     record: Record
@@ -118,11 +120,17 @@ class Planned:
     reference: Trajectory
     missed: Trajectory | None = None
     controller: ControllerSettings = field(default_factory=ControllerSettings)
+    given: bool = False
 
     @property
     def of_other_problem(self) -> bool:
-        """True if `problem` is known not to be the one that the record's plan was made for."""
-        return self.record.summary.get("problem", {}).get("hash") not in (None, self.problem.hash)
+        """True if `problem` is given, and known not to be the one that the record's plan was made for."""
+        return self.given and not _may_be_of(self.record, self.problem)
+
+
+def _may_be_of(record: Record, problem: ImpactProblem) -> bool:
+    """True unless a record's plan is known to be of another problem."""
+    return record.summary.get("problem", {}).get("hash") in (None, problem.hash)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -165,8 +173,8 @@ def load_planned(
         usual = "it is a strike, the impact alone" if strike else "the solve was stopped before there was one"
         note = record.summary.get("note", usual)
         raise InputError(f"{result} holds no motion to replay: {note}")
-    file = _problem_file(record, Path(result), problem_file, settings)
-    problem = _built(record, file, Path(result), given=problem_file is not None)
+    file, given = _problem_file(record, Path(result), problem_file, settings), problem_file is not None
+    problem = _built(record, file, Path(result), given=given)
     a, robot = record.arrays, problem.robot
     if list(a["joints"]) != list(robot.joint_names) or a["reference_q"].shape[1] != robot.model.nq:
         raise InputError(
@@ -180,6 +188,7 @@ def load_planned(
         reference=_trajectory(record, "reference"),
         missed=missed,
         controller=file.controller,
+        given=given,
     )
 
 
@@ -239,7 +248,7 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
     # another problem may refuse what the plan has, such as its order of touches, or have no plan with it
     with contextlib.suppress(InputError):
         own = _as_planned(record, problem)
-        if own.hash == record.summary.get("problem", {}).get("hash", own.hash):
+        if _may_be_of(record, own):
             return own
     return problem
 

@@ -23,6 +23,7 @@ from impactopt.bodies.world import (
     target_bodies,
 )
 from impactopt.collision.settings import Effects
+from impactopt.contact.fields import in_order
 from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
@@ -483,8 +484,7 @@ class ImpactProblem:
         They are in the order of a problem file, which leaves out defaults, so that a plan that was read from
         one has the same program.
         """
-        own = [term for term in self.terms if term not in DEFAULT_TERMS]
-        own.sort(key=lambda term: TERMS.index(type(term)) if type(term) in TERMS else len(TERMS))
+        own = in_order((term for term in self.terms if term not in DEFAULT_TERMS), TERMS)
         given = {type(term) for term in own}
         defaults = [
             t

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from impactopt.contact.fields import in_order
 from impactopt.errors import InputError
 from impactopt.problem.objectives import OBJECTIVES, Objective
 from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
@@ -242,10 +243,7 @@ class ContactProgram(ABC):
                 if not kind_of(term, Term).__module__.startswith("impactopt."):
                     self._check_own(type(term).__name__, since, before)
         # In the order of a problem file, as terms are.
-        known = sorted(
-            objectives, key=lambda o: OBJECTIVES.index(type(o)) if type(o) in OBJECTIVES else len(OBJECTIVES)
-        )
-        self.objectives = quantities(self, tuple(known))
+        self.objectives = quantities(self, in_order(objectives, OBJECTIVES))
         self._objective = assemble(self.layout, self.objectives, self._prices())
         # each round's set of clearance constraints is added to a copy of this builder
         self._without_clearance = self.builder

@@ -319,7 +319,7 @@ def test_what_touches_in_the_start_posture_may_touch() -> None:
         assert model.parents[a] != b and model.parents[b] != a
 
 
-@pytest.mark.parametrize(("apart", "touch"), [(5e-4, True), (2e-3, False)])
+@pytest.mark.parametrize(("apart", "touch"), [(1.5e-3, True), (3e-3, False)])
 def test_links_that_fit_into_each_other_touch(apart: float, touch: bool) -> None:
     problem = arm_problem()
     bodies, pair, q = problem.bodies, max(problem.bodies.pairs), problem.start_posture.copy()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -15,7 +15,7 @@ from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation.result import centre_of_pressure, travelled
-from impactopt.transcription.plan import Trajectory, pushed_aside
+from impactopt.transcription.plan import Trajectory, moved_in_contact, pushed_aside
 
 Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
@@ -66,8 +66,7 @@ class Track:
 def tracks_of(record: Record, problem: ImpactProblem) -> list[Track]:
     """Tracks of the planned motion, of the simulated ones, and of the planned one for a missing target.
 
-    The servo's reference coasts through contact; the planned robot does not. In contact it is drawn on the
-    cubic Hermite interpolation between the planned states before and after.
+    The servo's reference coasts through contact; the planned robot, which does not, is drawn.
     """
     present = [(name, prefix) for name, prefix in MOTIONS if f"{prefix}_q" in record.arrays]
     free = replay_name(record.summary)
@@ -99,7 +98,7 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
     chosen = _instants(time, start, end, float(a["reference_end"]) + AFTER)
     shown = time[chosen]
     if prefix == "reference":
-        q = _planned(problem, record)(chosen)
+        q = _planned(problem, record, chosen)
         wrench, force, speed = _predicted(record, chosen)
     elif prefix == MISSED:
         q, wrench, start, end = a["missed_q"][chosen], a["missed_ground"][chosen], np.nan, np.nan
@@ -170,28 +169,16 @@ def _instants(time: Array, start: float, end: float, last: float) -> NDArray[np.
     return np.unique(np.concatenate([before, at]).clip(0, len(time) - 1))  # both sides of a jump
 
 
-def _planned(problem: ImpactProblem, record: Record) -> Callable[[NDArray[np.intp]], Array]:
+def _planned(problem: ImpactProblem, record: Record, chosen: NDArray[np.intp]) -> Array:
     """Configurations (k, nq) of the plan at instants of its reference."""
-    a, model = record.arrays, problem.robot.model
-    time, phase, q, v = (a[f"reference_{name}"] for name in ("time", "phase", "q", "v"))
-    in_contact = np.flatnonzero(phase == 1)
-    if not len(in_contact):
-        return lambda chosen: np.asarray(q[chosen])
-    first, after = int(in_contact[0]), min(int(in_contact[-1]) + 1, len(time) - 1)
-    span = float(time[after] - time[first])
-    difference = pin.difference(model, q[first], q[after])
-
-    def at(chosen: NDArray[np.intp]) -> Array:
-        out = q[chosen].copy()
-        for k in np.flatnonzero(phase[chosen] == 1):
-            s = (time[chosen[k]] - time[first]) / span if span > 0 else 0.0
-            # cubic Hermite interpolation in the tangent space: linear part, and part of the end velocities
-            start, end = span * v[first] - difference, span * v[after] - difference
-            bend = s * (1 - s) * ((1 - s) * start - s * end)
-            out[k] = pin.integrate(model, q[first], s * difference + bend)
-        return np.asarray(out)
-
-    return at
+    a, c = record.arrays, problem.coordinates
+    q, contact = a["reference_q"][chosen], a["reference_phase"][chosen] == 1
+    # an impact without duration has no motion, and records of older versions do not have it
+    if (motion := a.get("collision_motion")) is not None and len(motion):
+        since = a["reference_time"][chosen][contact] - float(a["reference_contact_start"])
+        y = moved_in_contact(a["collision_time"], motion, since)
+        q[contact] = [posture for posture, _ in c.leg_closure.follow(y, c.start_legs)]
+    return np.asarray(q)
 
 
 def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, Array]:

@@ -533,20 +533,25 @@ class Collision(ContactParameters):
         return ContactEnd(place, before, self._motion(last), self.u[last] - u0)
 
     def _joints(self, x: Array, law: ContactLaw) -> dict[str, Array]:
-        """Joint velocities and accelerations (1 + stages, n), the first just after contact, for solver
-        variables.
-        """
+        """Fields of `PlannedCollision` about the robot's motion, for solver variables."""
         b, c, state = self._b, self._b.coordinates, self.contact.state
         y, rates, legs = (e.evaluate(x) for e in (state.y, self.contact.u0[0], state.legs))
+        motion = [(y, rates)]
         velocity = [c.complete_motion(y, rates, 0 * rates, legs)[1][c.base :]]
         acceleration = [jump_at_contact(b.problem, c, law, y, rates, legs)[3]]
         for i in range(len(self.stages)):
             # slots of `_motion`; the S among them is one
             y0, d1, T1, d, T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i))
-            _, v, a = c.complete_motion(y0 + T1 * d1 + T * d, u, slope / T, legs_there)
+            y = y0 + T1 * d1 + T * d
+            _, v, a = c.complete_motion(y, u, slope / T, legs_there)
+            motion.append((y, u))
             velocity.append(v[c.base :])
             acceleration.append(a[c.base :])
-        return {"velocity": np.array(velocity), "acceleration": np.array(acceleration)}
+        return {
+            "motion": np.array(motion),
+            "velocity": np.array(velocity),
+            "acceleration": np.array(acceleration),
+        }
 
     def _add_integral(self, i: int, place: Place, integrals: Group, rate: Group) -> None:
         """Add the constraints of integrals over the phase so far: Radau quadrature of the rates' values."""

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
+from scipy.interpolate import CubicHermiteSpline
 
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates, base_rates, solved
@@ -299,6 +300,17 @@ def pushed_aside(time: Array, velocity: Array, since: Array) -> Array:
     return np.asarray(within + np.maximum(since - time[-1], 0.0)[:, None] * velocity[-1])
 
 
+def moved_in_contact(time: Array, motion: Array, since: Array) -> Array:
+    """Independent coordinates (k, ny) of the robot at times (k,) [s] since contact.
+
+    time (m,), motion (m, 2, ny) : of `PlannedCollision`.
+    """
+    # Between all states of the collision: between its first and its last one alone, a link would be up to
+    # 10 mm off (preset punch_g1), as a light hand loses its speed at once.
+    y, rates = motion.swapaxes(0, 1)
+    return np.asarray(CubicHermiteSpline(time, y, rates)(since))
+
+
 @dataclass(frozen=True, kw_only=True)
 class PlannedCollision:
     """Predicted collision of a plan, at contact and at the m collocation points.
@@ -313,8 +325,10 @@ class PlannedCollision:
     torque (m + 1, n) : servo and feed-forward [N m].
     ground (m, 6) : ground wrench about the world's origin [N, N m].
     sole_wrench (m, 6 a sole, 6 a supporting hand) : in their own frames [N, N m].
-    velocity, acceleration (m + 1, n) : of the joints; (0, 0): unknown. The first is the limit from the right:
-        the force of a damped contact jumps at contact.
+    motion (m + 1, 2, ny) : independent coordinates and their rates.
+    velocity, acceleration (m + 1, n) : of the joints. The first is the limit from the right: the force of a
+        damped contact jumps at contact.
+    Of an impact without duration the last three are empty.
     """
 
     time: Array = field(repr=False)
@@ -324,6 +338,7 @@ class PlannedCollision:
     torque: Array = field(repr=False)
     ground: Array = field(repr=False)
     sole_wrench: Array = field(repr=False)
+    motion: Array = field(default_factory=lambda: np.zeros((0, 2, 0)), repr=False)
     velocity: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     acceleration: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     forces: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
@@ -636,8 +651,8 @@ class Plan:
     ) -> Motion:
         """Expected motion of the robot's bodies, at the reference's instants from start to rest.
 
-        In contact the contact force slows the robot below the servo's reference, so there the motion is the
-        cubic Hermite interpolant of the states before and after contact, about every ``step`` [s].
+        In contact the contact force slows the robot below the servo's reference, so there the motion is that
+        of the collision (`through_contact`), about every ``step`` [s].
 
         reference : result of :meth:`trajectory`; default: every millisecond.
         missed : nothing is hit, as in the reference; the motion from the planned contact on (before, it is as
@@ -663,14 +678,14 @@ class Plan:
         )
 
     def through_contact(self, s: Array, *, missed: bool = False) -> Array:
-        """Independent coordinates (k, ny) at fractions s (k,) of the contact: a cubic Hermite interpolant."""
-        t0, (_, t1, _, _) = self.contact_start, self.segment(2, missed=missed)
-        (y0,), (u0,), _, _ = self.independent(0, np.array([t0]), missed=missed)
-        (y1,), (u1,), _, _ = self.independent(2, np.array([t1]), missed=missed)
-        span, chord, at = t1 - t0, y1 - y0, s[:, None]
-        # the cubic with the values y0, y1 and the slopes span u0, span u1 in s
-        bend = at * (1 - at) * ((1 - at) * (span * u0 - chord) - at * (span * u1 - chord))
-        return np.asarray(y0 + at * chord + bend)
+        """Independent coordinates (k, ny) at fractions s (k,) of the contact.
+
+        missed : they are those of the reference, which coasts.
+        """
+        t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
+        if missed or t1 <= t0:
+            return self.independent(1, t0 + (t1 - t0) * s, missed=missed)[0]
+        return moved_in_contact(self.collision.time, self.collision.motion, (t1 - t0) * s)
 
     def travel(self, time: Array) -> Array:
         """Displacement (k,) [m] of the target along the normal at times (k,) [s] since the motion's start.

@@ -55,6 +55,7 @@ from impactopt.transcription.transcription import Transcription, statement_of
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
 _HOPELESS_ITERATIONS = 100  # of each program of a problem that is unlikely to have a solution
+_SAME_POSTURE = 1e-6  # [rad], [m] largest difference of a coordinate
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 
 
@@ -174,7 +175,9 @@ def _planned(
     # A solution of a similar problem is more than an estimate, so with one all iterations are allowed.
     outcome = _best(guesses, len(which), solver, doubted=bool(doubts) and not isinstance(given, SolverResult))
     violated = ended_with_violations(outcome.program, outcome.result)
-    if isinstance(given, str) and given == "reach" and violated and not doubts and not budget.is_over():
+    reach = isinstance(given, str) and given == "reach" and not doubts
+    # Of starts on several processes, the first alone tries it: it is the same posture for all.
+    if reach and violated and which.start == 0 and not budget.is_over():
         outcome = _else_from_other_posture(t, outcome, solver)
     if refined and margins is None:
         outcome = solver.on(outcome)
@@ -337,9 +340,10 @@ def _else_from_other_posture(
     """
     p, used = t.problem, strongest_posture(t.problem)
     posture = p.contact_posture
-    if np.array_equal(posture, used):
+    # Postures come of iterations: equal ones differ in their last digits.
+    if np.allclose(posture, used, atol=_SAME_POSTURE):
         posture = drawn_posture(p)
-    if np.array_equal(posture, used):
+    if np.allclose(posture, used, atol=_SAME_POSTURE):
         return outcome
     solver.budget.say("no motion was found: solving again from another posture at contact")
     guess = Guess(program=t, start=first_iterate(t, posture=posture))

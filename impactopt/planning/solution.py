@@ -18,7 +18,13 @@ from impactopt.errors import counted
 from impactopt.planning.bounds import Cause
 from impactopt.planning.contact_replay import SOLVED_WITHIN, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gain_selection import ChosenGains
-from impactopt.planning.lazy_constraints import gear_caution, lazy_terms_of, meets_again, slide, slide_caution
+from impactopt.planning.lazy_constraints import (
+    gear_caution,
+    lazy_terms_of,
+    slide,
+    slide_caution,
+    touch_caution,
+)
 from impactopt.planning.refinement import Attempt, Outcome
 from impactopt.problem.feasibility import overlapping
 from impactopt.problem.problem import ImpactProblem
@@ -325,7 +331,7 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        slides, again = slide_caution(self.problem, self.slide), meets_again(self.problem, plan)
+        slides, again = slide_caution(self.problem, self.slide), touch_caution(self.problem, plan)
         cautions = (out.get("caution"), again, slides, self.window, overlapping(self.problem))
         if caution := " ".join(filter(None, cautions)):
             out["caution"] = caution

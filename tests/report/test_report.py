@@ -28,8 +28,8 @@ from impactopt import (
     Status,
     TargetBody,
     load_problem,
-    planar_arm,
     load_robot,
+    planar_arm,
 )
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.visuals import surroundings_of, visuals_of

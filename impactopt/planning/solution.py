@@ -298,7 +298,7 @@ class Solution(Solved):
         expected, *others = self._collisions
         out: dict[str, Any] = {
             **self.outcome(),
-            **impact_summary(plan, expected),
+            **impact_summary(plan, expected, self.contact_replay),
             "objectives": dict(self.objectives),
             "motion_price_pct": self.motion_price_pct,
             "duration_s": plan.duration,
@@ -338,13 +338,18 @@ class Solution(Solved):
         return out | gear_caution(self.problem, [self.loads, *replayed])
 
 
-def impact_summary(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
+def impact_summary(
+    hit: Plan | PlannedStrike, collision: PlannedCollision, replay: ContactReplay | None
+) -> dict[str, Any]:
     """Entries of ``summary.json`` for a planned impact; one without duration has no force."""
-    duration = hit.compression + hit.restitution
+    duration, peak = hit.compression + hit.restitution, collision.peak_force
+    # the force between the program's points, where no finer mesh has it
+    if collision is hit.collision and replay is not None and not replay.unforeseen:
+        peak = replay.peak
     return {
         "impulse_Ns": hit.impulse,
         "target": collision.outcome,
-        "peak_force_N": collision.peak_force if duration > 0 else None,
+        "peak_force_N": peak if duration > 0 else None,
         "contact_ms": 1e3 * hit.collision.last_touch if duration > 0 else 0.0,
         "hand_speed_m_s": hit.hand_speed,
     }

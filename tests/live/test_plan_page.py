@@ -252,6 +252,7 @@ def test_the_largest_force_on_a_page_is_that_of_full_dynamics() -> None:
         peak = plan.validate().peak_force
         found = re.search(r"(\d+) N at most", plan_message(Answer(solution=plan), nail))
         assert found is not None and float(found[1]) == pytest.approx(peak, rel=5e-3)
+        assert plan.summary()["peak_force_N"] == pytest.approx(peak, rel=5e-3)
         assert plan.plan.collision.peak_force < 0.97 * peak
 
 

@@ -170,6 +170,15 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
             _drafted(tmp_path, text, motion=motion)
 
 
+def test_legs_that_hang_below_the_ground_when_bolted_are_told(tmp_path: Path) -> None:
+    """The message was only that no target is found. On a mount of a metre there is one."""
+    text = urdfs.biped(arms=False)
+    with pytest.raises(
+        InputError, match=r"'right_hand' hangs 0.88 m below the ground; place the root higher"
+    ):
+        _drafted(tmp_path, text, bolted=True)
+
+
 def test_an_arm_in_millimetres_has_no_posture_and_is_told_why(tmp_path: Path) -> None:
     def scaled(found: re.Match[str]) -> str:
         return f'{found[1]}="{" ".join(str(1e3 * float(x)) for x in found[2].split())}"'

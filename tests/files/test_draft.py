@@ -170,6 +170,7 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
             _drafted(tmp_path, text, motion=motion)
 
 
+@pytest.mark.slow
 def test_legs_that_hang_below_the_ground_when_bolted_are_told(tmp_path: Path) -> None:
     """The message was only that no target is found. On a mount of a metre there is one."""
     text = urdfs.biped(arms=False)

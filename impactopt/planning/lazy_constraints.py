@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.planning.parameter_changes import changed
@@ -202,7 +201,7 @@ _BARRIER = 1e-2
 # Excess over a gear limit (of it) from which the initial guess is tried before the warm start: the motion
 # within the limit is a different one.
 _FAR_BEYOND = 0.5
-_KINDS: dict[str, type[Term]] = {snake_case(type(term).__name__): type(term) for term in ON_DEMAND_TERMS}
+_KINDS: dict[str, type[Term]] = {term.section: type(term) for term in ON_DEMAND_TERMS}
 
 
 def lazy_terms_of(problem: ImpactProblem) -> tuple[str, ...]:

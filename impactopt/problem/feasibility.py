@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from impactopt.bodies.clearance import Places, Touch
-from impactopt.contact.fields import snake_case
 from impactopt.contact.targets import Nail
 from impactopt.errors import InputError, counted
 from impactopt.kinematics.inverse_kinematics import Reach, inverse_kinematics, reach
@@ -163,8 +162,7 @@ def without_effect(problem: ImpactProblem) -> list[str]:
     kinds = (Balance, ContactWrenchCone, GroundForce, LegExtension)
     given = [term for term in problem.terms if isinstance(term, kinds) and term not in DEFAULT_TERMS]
     return out + [
-        f"[terms.{snake_case(type(term).__name__)}] has no effect: it is of soles on the ground, and none "
-        "stands there"
+        f"[terms.{term.section}] has no effect: it is of soles on the ground, and none stands there"
         for term in given
         if not problem.soles and getattr(term, "enabled", True)
     ]

@@ -463,6 +463,9 @@ def test_a_joint_without_a_motor_in_a_leg_of_seven_is_locked(tmp_path: Path) -> 
     problem = _problem(tmp_path, text)
     data = read_toml((tmp_path / "robot.toml").read_text())["robot"]
     assert data["locked_rad"] == {"left_tarsus": 0.0, "right_tarsus": 0.0}
+    # which the file does not say: an effort of 0 is as often one that nobody has filled in
+    (said,) = [line for line in _drafted(tmp_path, text).said if line.startswith("locked: ")]
+    assert "the file has no effort: else unlock it, with torque_limit_N_m (2 joints)" in said
     assert "torque_limit_N_m" not in data
     problem.robot.check_stance(problem.start_posture, tilt=1e-5)
 

@@ -139,8 +139,7 @@ def solve(
     if problem.floats and isinstance(start, str) and start == "strike":
         raise InputError(f"robot {problem.robot.name!r} floats freely, and has no strike: start from 'reach'")
     one = partial(_planned, seed, refine)
-    best = best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
-    return with_limits_kept(best) if refine else best
+    return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
 
 
 def _planned(
@@ -194,6 +193,7 @@ def _planned(
     # Fixing the gains has solved again, at the nodes alone.
     again = margins if gains and refined else None
     outcome = BetweenNodes(budget, again).checked(outcome)
+    outcome = _with_limits_kept(outcome) if refined else outcome
     usable = outcome.usable
     return solution_of(
         outcome,
@@ -247,7 +247,9 @@ class PlanSolver:
         """Outcome of an initial guess, with the lazy constraints and the prices of motion that it needs."""
         # Prices last: each reduction changes the motion, and the lazy terms are checked again.
         oracles: list[Oracle[Transcription]] = [LazyTerms(self.budget.report), MotionPrice()]
-        return refine(self._solved(guess), oracles, self._solved, self.budget)
+        outcome = refine(self._solved(guess), oracles, self._solved, self.budget)
+        # before starts are compared
+        return _with_limits_kept(outcome) if self.refined else outcome
 
     def on(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
         """Solution refined between its nodes, which `from_guess` has not done without clearance
@@ -306,6 +308,18 @@ class PlanSolver:
         found = self._between(Outcome.of(free, self.budget.run(free.program, stuck.origin.x), stuck.origin))
         # Either way the result has the effort of both.
         return stuck.then(found) if found.usable else found.then(stuck)
+
+
+def _with_limits_kept(outcome: Outcome[Transcription]) -> Outcome[Transcription]:
+    """Outcome whose status is acceptable if its plan loses limits between nodes (`with_limits_kept`)."""
+    t, at = outcome.program, outcome.at
+    # the robot's own gains are not those of the plan while these are open
+    if outcome.result.status is not Status.SOLVED or t.problem.gains:
+        return outcome
+    error = at.contact_error
+    finer = () if error is None or error.missed else error.finer
+    hit = finer[0] if finer else at.planned.collision
+    return replace(outcome, result=with_limits_kept(outcome.result, at.planned, hit, t.problem.robot))
 
 
 def _best(

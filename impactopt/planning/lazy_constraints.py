@@ -284,8 +284,7 @@ class LazyTerms(Generic[Program]):
     def _gears(self, outcome: Outcome[Program]) -> list[DriveLoads]:
         """Gear loads of a solution."""
         error = outcome.at.contact_error if self._finer else None
-        # A contact that misses an event on the finer mesh is another contact.
-        finer = () if error is None or error.missed else error.finer
+        finer = () if error is None else error.finer
         return _loads(outcome.program.robot, outcome.at.planned, finer)
 
 

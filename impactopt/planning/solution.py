@@ -266,7 +266,7 @@ class Solution(Solved):
         plan.
         """
         planned = [self.plan.collision, *(scenario.collision for scenario in self.plan.scenarios)]
-        if self.contact_error is None or self.contact_error.missed or not self.contact_error.finer:
+        if self.contact_error is None or not self.contact_error.finer:
             return planned
         finer = zip(self.contact_error.finer, planned, strict=True)
         return [replace(new, outcome=old.outcome) for new, old in finer]

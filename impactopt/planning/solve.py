@@ -316,9 +316,8 @@ def _with_limits_kept(outcome: Outcome[Transcription]) -> Outcome[Transcription]
     # the robot's own gains are not those of the plan while these are open
     if outcome.result.status is not Status.SOLVED or t.problem.gains:
         return outcome
-    error = at.contact_error
-    finer = () if error is None or error.missed else error.finer
-    hit = finer[0] if finer else at.planned.collision
+    error, hit = at.contact_error, at.planned.collision
+    hit = error.finer[0] if error is not None and error.finer else hit
     return replace(outcome, result=with_limits_kept(outcome.result, at.planned, hit, t.problem.robot))
 
 

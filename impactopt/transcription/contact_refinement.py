@@ -51,7 +51,8 @@ class ContactError:
     missed : an event is missed.
     strained : by phase and element, a gear carries more than it may between the plan's collocation points.
     finer : the collisions on elements half as long, in the program's order, as torque and ZMP may be worse
-        between the plan's points. Empty if they were not found.
+        between the plan's points. Empty if they were not found, or are other contacts as an event is
+        missed.
     """
 
     pct: float
@@ -84,14 +85,15 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
         of_elements.append(np.linalg.norm(of_element, axis=1))
         errors.append(_impulse_error(new, old, by_law, x))
     ends = np.cumsum([len(phase) for phase in t.hit.elements])[:-1]
+    missed = bool(np.isinf(errors).any())
     strained = np.any([_strained(t, hit, contact.hit.stages) for hit in finer], axis=0)
     return ContactError(
         pct=max(errors, key=abs),
         coarse=max(coarse, key=abs),
         of_elements=tuple(tuple(map(float, phase)) for phase in np.split(np.max(of_elements, axis=0), ends)),
-        missed=bool(np.isinf(errors).any()),
+        missed=missed,
         strained=tuple(tuple(map(bool, phase)) for phase in np.split(strained, ends)),
-        finer=tuple(finer),
+        finer=() if missed else tuple(finer),
     )
 
 

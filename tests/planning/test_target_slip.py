@@ -168,6 +168,7 @@ class Sprung(Target):
         return [state[0]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", [1.0, 20.0])
 def test_a_target_that_swings_back_is_told(mass: float) -> None:
     """The planned impulse was half of the replayed one, without a word. A heavy one comes back late."""

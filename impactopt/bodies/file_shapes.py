@@ -43,13 +43,14 @@ def urdf_elements(urdf: str | None, tag: str) -> list[ElementTree.Element]:
 
 
 def shapes_of(
-    model: Any, urdf: str | None, kind: str, *, without: Collection[str] = ()
+    model: Any, urdf: str | None, kind: str, *, without: Collection[str] = (), far: bool = False
 ) -> Iterator[LinkShape]:
     """Readable shapes of a ``kind``, "collision" or "visual", of the links that a pin.Model has.
 
     Malformed shapes, and meshes that are missing or damaged, are left out.
 
-    without : names of links to leave out.
+    without : names of links to leave out.  far : those that are too far to be part of a robot, which are left
+        out else.
     """
     for link in urdf_elements(urdf, "link"):
         name = link.get("name", "")
@@ -64,9 +65,9 @@ def shapes_of(
                 # merges links of fixed joints.
                 place = frame.placement * origin
                 moved = solid.moved(place.rotation, place.translation)
-                if not (np.abs(moved.vertices) <= FARTHEST).all():
-                    continue  # not finite, or too far to be part of a robot
-                yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
+                # as are those whose vertices are not finite
+                if bool((np.abs(moved.vertices) <= FARTHEST).all()) is not far:
+                    yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
 
 
 def lost_meshes(model: Any, urdf: str | None, *, without: Collection[int] = ()) -> dict[int, dict[str, str]]:

@@ -169,6 +169,8 @@ def _result(result: Path, problem: Path | None) -> tuple[Page, Path, str]:
         )
     record = load_record(result)
     about, caution = None, ""
+    if problem is not None and not record.completed:
+        raise InputError(f"--problem is for a whole motion, and {str(result)!r} holds none: leave it out")
     if record.completed:
         planned = load_planned(result, problem_file=problem)
         about, caution = planned.problem, _caution(planned, problem)

@@ -30,10 +30,16 @@ def across(direction: Array) -> Array:
 
 
 def striking_point(robot: Robot, striker: str, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Position (3,) [m] of a striker's striking point in the world, at a configuration q (nq,)."""
+    """Position (3,) [m] of a striker's striking point in the world, at a configuration q (nq,); (k, 3) at
+    configurations (k, nq).
+    """
     model, data = robot.model, robot.model.createData()
-    pin.framesForwardKinematics(model, data, q)
-    return np.array(data.oMf[model.getFrameId(robot.striker(striker).model_frame)].translation)
+    frame = model.getFrameId(robot.striker(striker).model_frame)
+    points = []
+    for posture in np.atleast_2d(q):
+        pin.framesForwardKinematics(model, data, posture)
+        points.append(data.oMf[frame].translation.copy())
+    return np.reshape(points, (*q.shape[:-1], 3))
 
 
 def static_wrenches(c: StanceCoordinates, y: Array, legs: Array) -> Array:

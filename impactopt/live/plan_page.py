@@ -14,7 +14,7 @@ from impactopt.live.drawing import Drawing, moment_of
 from impactopt.live.replanning import MAX_VIOLATIONS, Answer, Replanning
 from impactopt.live.requests import LatestRequest, PlanRequest, request_of, slider_parameters
 from impactopt.live.server import LOCAL, LivePage, served
-from impactopt.planning.solution import Solution
+from impactopt.planning.solution import Solution, impact_summary
 from impactopt.report.stage import middle
 from impactopt.report.tracks import Track
 from impactopt.solvers.program import Status
@@ -167,8 +167,7 @@ def plan_message(answer: Answer, first: Solution) -> str:
         f"- {plan.hand_speed:.2f} m/s at contact",
     ]
     if duration > 0:
-        replay = solution.contact_replay  # the program's points may miss the peak by some per cent
-        peak = plan.collision.peak_force if replay is None else replay.peak
+        peak = impact_summary(plan, solution.collision, solution.contact_replay)["peak_force_N"]
         lines.append(f"- {peak:.0f} N at most, for {1e3 * duration:.1f} ms")
     for name, label, unit, factor in (
         ("zmp_margin_m", "ZMP margin", " mm", 1e3),

@@ -17,7 +17,8 @@ from impactopt.planning.solve import solve
 from impactopt.report.tracks import Track, planned_track
 from impactopt.solvers.program import IterationRecord, Status
 
-TIME_LIMIT = 20.0  # [s] of each of the two solves
+TIME_LIMIT = 40.0  # [s] of an answer
+REPLANNING_SHARE = 0.25  # of that for re-planning, which succeeds in a second or so, or not at all
 MAX_VIOLATIONS = 5  # that are reported
 
 
@@ -40,7 +41,8 @@ class Replanning:
     """Planner for requests, from a first plan.
 
     A request is re-planned from the first plan (`moved_solution`), so that the same sliders give the same
-    plan, whatever came before. If that fails, it is solved from the latest plan, which may be nearer.
+    plan, whatever came before. If that fails, it is solved from the latest plan, which may be nearer; or from
+    a plain reach, if that is the plan from which re-planning has failed.
     """
 
     def __init__(self, first: Solution, *, time_limit: float = TIME_LIMIT) -> None:
@@ -73,16 +75,17 @@ class Replanning:
         def stop(_: IterationRecord) -> bool:
             return stale()
 
-        common: dict[str, Any] = {"callback": stop, "time_limit": self.time_limit}
-        try:
-            moved = moved_solution(self.first, **changes, **common)
-        except InputError:
-            # the program has other constraints; or the problem is wrong, and the solve below raises again
-            moved = None
+        brief, moved = REPLANNING_SHARE * self.time_limit, None
+        # the program has other constraints; or the problem is wrong, and the solve below raises again
+        with contextlib.suppress(InputError):
+            moved = moved_solution(self.first, **changes, callback=stop, time_limit=brief)
         if moved is not None and (moved.status.usable or stale()):
             return moved
         problem = moved_problem(self.first.problem, **changes)
-        return solve(problem, start=self.latest, options=REPLANNING_TOLERANCES, **common)
+        # so far from a plan a warm start takes longer than none
+        start = "reach" if moved is not None and self.latest is self.first else self.latest
+        rest = self.time_limit - brief
+        return solve(problem, start=start, options=REPLANNING_TOLERANCES, callback=stop, time_limit=rest)
 
 
 def failure_reason(solution: Solution) -> str:

@@ -8,7 +8,6 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
 
-from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
 from impactopt.planning.budget import Budget, touching, with_effort_of
 from impactopt.planning.clearance_constraints import (
@@ -87,10 +86,9 @@ class BetweenNodes:
         margins, told = self._margins, []
         assert margins is not None
         for pair, distance in sorted(lost.nearest.items(), key=lambda item: item[1])[:MAX_NAMED]:
-            section = snake_case(type(margins.term(pair)).__name__)
             told.append(
                 f"{' and '.join(margins.bodies.names(pair))} {1e3 * distance:.2g} mm instead of "
-                f"{1e3 * margins.of(pair):.2g} ([terms.{section}] margin_m)"
+                f"{1e3 * margins.of(pair):.2g} ([terms.{margins.term(pair).section}] margin_m)"
             )
         message = f"Bodies keep less than half of their clearance: {'; '.join(told)}."
         return replace(result, status=Status.ACCEPTABLE, message=message)

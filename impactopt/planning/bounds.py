@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.contact.fields import abouts, snake_case
+from impactopt.contact.fields import abouts
 from impactopt.errors import InputError
 from impactopt.planning.parameter_changes import changed, with_term
 from impactopt.planning.refinement import program_for
@@ -302,8 +302,7 @@ def _gear_loads(t: Transcription, term: GearLoad) -> Iterator[Bound]:
 def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> Iterator[Cause]:
     """Parameters of a term each of which alone, with another value, makes variables (n,) feasible."""
     kind = {TorqueLimit: "torque", VelocityLimit: "speed"}.get(type(term), term.name)
-    type_name = type(term).__name__
-    section = f"[terms.{snake_case(type_name)}] " if type(term) in TERMS else f"{type_name}."
+    section = f"[terms.{term.section}] " if type(term) in TERMS else f"{type(term).__name__}."
     about_field = {field.name: about for field, about in abouts(type(term))}
     constraints = _inequalities(t, select).tolist()
     violations = constraint_violations(t.program, t.program.constraints(x))

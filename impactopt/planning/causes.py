@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
 from impactopt.planning.bounds import (
     FEASIBLE,
@@ -96,7 +95,7 @@ class _CauseSearch:
         self._iterations = max(_MIN_ITERATIONS, result.iterations)
         # With the constraints of all lazy terms, or a changed bound would be confirmed by a motion that
         # violates those.
-        names = [snake_case(type(term).__name__) for term in t.problem.on_demand]
+        names = [term.section for term in t.problem.on_demand]
         p = with_lazy_constraints(t.problem, names)
         self.t = program_for(t, p)
         zero_multipliers = np.zeros(t.program.m), np.zeros(t.layout.n)

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.planning.bounds import Cause
 from impactopt.planning.budget import VIOLATED, Budget
-from impactopt.planning.solution import Solution
 from impactopt.problem.checks import met_once
 from impactopt.problem.feasibility import too_weak
 from impactopt.robots.loads import shortfalls
+from impactopt.robots.robot import Robot
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import Parting, fastest_at_contact, parting
 from impactopt.transcription.contact_program import ContactProgram
+from impactopt.transcription.plan import Plan, PlannedCollision
 
 Array = NDArray[np.float64]
 MAX_NAMED = 3  # margins in a message
@@ -93,30 +94,31 @@ def with_reason(
     return replace(result, status=Status.INFEASIBLE, message=f"{why} {rest}")
 
 
-def with_limits_kept(solution: Solution) -> Solution:
-    """The solution itself if it keeps at least half of each sole's margin between nodes, too, and no joint is
-    beyond the robot's limits; else with the status acceptable, and a message that names them.
+def with_limits_kept(
+    result: SolverResult, plan: Plan, collision: PlannedCollision, robot: Robot
+) -> SolverResult:
+    """A solved result itself if its plan keeps at least half of each sole's margin between nodes, too, and no
+    joint is beyond the robot's limits; else with the status acceptable, and a message that names them.
+
+    collision : of the plan, on a finer mesh if there is one.
     """
-    if solution.status is not Status.SOLVED:
-        return solution
     with contextlib.suppress(InputError):  # legs out of reach: completing the motion reports it
-        if short := shortfalls(solution.sole_margins()):
+        if short := shortfalls(plan.sole_margins(collision)):
             message = (
                 f"A sole keeps less than half of a margin between nodes: {'; '.join(short[:MAX_NAMED])}."
             )
-        elif beyond := _joints_beyond(solution):
+        elif beyond := _joints_beyond(plan, robot):
             message = f"Between nodes {beyond}; give more `intervals`, or more time."
         else:
-            return solution
-        return replace(solution, result=replace(solution.result, status=Status.ACCEPTABLE, message=message))
-    return solution
+            return result
+        return replace(result, status=Status.ACCEPTABLE, message=message)
+    return result
 
 
-def _joints_beyond(solution: Solution) -> str:
+def _joints_beyond(plan: Plan, robot: Robot) -> str:
     """Message with the joint that is farthest beyond the robot's limit of velocity or torque; "" if none."""
-    robot, plan = solution.problem.robot, solution.plan
     worst, message = 1 + VIOLATED, ""
-    for t in (solution.trajectory, *([plan.missed_reference] if plan.abort is not None else [])):
+    for t in (plan.reference, *([plan.missed_reference] if plan.abort is not None else [])):
         for what, used in (
             ("velocity", t.v[:, -robot.n :] / robot.velocity_limit),
             ("torque", t.torque / robot.torque_limit),

@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Generic
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 
-from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.planning.parameter_changes import changed
@@ -26,6 +27,7 @@ from impactopt.transcription.mesh import GEAR
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, plan_loads, strike_loads
 from impactopt.transcription.transcription import Transcription
 
+Array = NDArray[np.float64]
 # Tolerances beyond a limit. In replays of a plan that keeps its gear limits, loads stay within the first one
 # (of the limit). The others are what a plan with constraints exceeds between its nodes.
 REPLAY_GEAR_TOLERANCE = 0.1
@@ -72,7 +74,7 @@ def slide(problem: ImpactProblem, plan: Plan) -> float:
     if len(plan.collision.time) < 2 or plan.collision.time[-1] <= 0:
         return 0.0
     postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, CONTACT_SAMPLES)))
-    points = np.array([striking_point(problem.robot, problem.striker, q) for q in postures])
+    points = striking_point(problem.robot, problem.striker, postures)
     points -= plan.collision.aside(np.linspace(0.0, plan.collision.time[-1], CONTACT_SAMPLES))
     tangential = (points - points[0]) @ across(problem.normal).T
     return float(np.linalg.norm(tangential, axis=1).max())
@@ -83,10 +85,8 @@ def slides_beyond(term: Slide, plan: Plan) -> str:
     tangent, but for a tolerance.
     """
     problem = plan.problem
-    begin, end = (
-        striking_point(problem.robot, problem.striker, q)
-        for q in plan.closed(plan.through_contact(np.array([0.0, 1.0])))
-    )
+    ends = plan.closed(plan.through_contact(np.array([0.0, 1.0])))
+    begin, end = striking_point(problem.robot, problem.striker, ends)
     # The constraint bounds the offset along each tangent, so it is a square, not a circle.
     far = float(np.abs(across(problem.normal) @ (end - begin)).max())
     if far <= (1 + SLIDE_TOLERANCE) * term.most:
@@ -123,28 +123,48 @@ def slide_caution(problem: ImpactProblem, length: float) -> str:
     )
 
 
-def meets_again(problem: ImpactProblem, plan: Plan) -> str:
-    """Warning about a striking point that reaches the target again in the follow-through, such as a slow one;
-    "" without. The target keeps its last speed. One that stays, or whose speed is bounded, has constraints.
+def touch_caution(problem: ImpactProblem, plan: Plan) -> str:
+    """Warning about a striking point that meets the target again in the follow-through, such as a slow target
+    or one on a spring; "" without. Constraints keep it off a target that stays, or, with `TargetSpeed`, keeps
+    its speed.
     """
-    if problem.target.stays or not problem.lasts or problem.extra(TargetSpeed) is not None:
+    if problem.target.stays or not problem.lasts:
         return ""
     reference = plan.coarse_reference
     after = reference.phase == 2
     time, postures = reference.time[after], reference.q[after]
-    plane = plan.travel(time)[:, None] * problem.normal + plan.aside(time)
+    travel, remedy = _travel_after(problem, plan, time), "a replay has all touches"
+    if np.abs(travel - plan.travel(time)).max() < _MET:
+        if problem.extra(TargetSpeed) is not None:
+            return ""
+        remedy = "[terms.target_speed] keeps it off, with least_m_s = -inf and most_m_s = inf at any speed"
+    plane = travel[:, None] * problem.normal + plan.aside(time)
     for striker, point in problem.contacts:
-        offset = np.array([striking_point(problem.robot, striker, q) for q in postures]) - point - plane
+        offset = striking_point(problem.robot, striker, postures) - point - plane
         beyond = offset @ problem.normal
         over_face = np.linalg.norm(offset @ across(problem.normal).T, axis=1) < FACE
         again = np.flatnonzero(over_face & (beyond > max(beyond[0], 0.0) + _MET))
         if again.size:
             return (
                 f"{striker} meets the target again {time[again[0]] - plan.contact_start:.2g} s after contact "
-                "began, which the planned impulse leaves out; [terms.target_speed] keeps it off, with "
-                "least_m_s = -inf and most_m_s = inf at any speed."
+                f"began, which the planned impulse leaves out; {remedy}."
             )
     return ""
+
+
+def _travel_after(problem: ImpactProblem, plan: Plan, time: Array) -> Array:
+    """Travel (k,) [m] of the target by its own motion, such as on a spring, at times (k,) [s] after contact.
+
+    `Plan.travel` takes its speed for constant.
+    """
+    target, known = problem.target, plan.travel(time)
+
+    def rates(_: float, y: Array) -> list[float]:
+        return [float(rate) for rate in (target.velocity(y[1:]), *target.derivative(y[1:], 0.0))]
+
+    begin = [known[0], *plan.collision.target_state]
+    found = solve_ivp(rates, (time[0], time[-1]), begin, t_eval=time, rtol=1e-6, atol=1e-9)
+    return np.asarray(found.y[0]) if found.success else known
 
 
 def window_caution(t: Transcription, result: SolverResult) -> str:
@@ -181,7 +201,7 @@ _BARRIER = 1e-2
 # Excess over a gear limit (of it) from which the initial guess is tried before the warm start: the motion
 # within the limit is a different one.
 _FAR_BEYOND = 0.5
-_KINDS: dict[str, type[Term]] = {snake_case(type(term).__name__): type(term) for term in ON_DEMAND_TERMS}
+_KINDS: dict[str, type[Term]] = {term.section: type(term) for term in ON_DEMAND_TERMS}
 
 
 def lazy_terms_of(problem: ImpactProblem) -> tuple[str, ...]:
@@ -264,8 +284,7 @@ class LazyTerms(Generic[Program]):
     def _gears(self, outcome: Outcome[Program]) -> list[DriveLoads]:
         """Gear loads of a solution."""
         error = outcome.at.contact_error if self._finer else None
-        # A contact that misses an event on the finer mesh is another contact.
-        finer = () if error is None or error.missed else error.finer
+        finer = () if error is None else error.finer
         return _loads(outcome.program.robot, outcome.at.planned, finer)
 
 

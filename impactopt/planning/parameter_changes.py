@@ -149,11 +149,11 @@ def parameter_of(problem: ImpactProblem, name: str) -> Parameter:
     # Terms that hold by default have parameters, too.
     others = [term for term in DEFAULT_TERMS if not any(isinstance(t, type(term)) for t in problem.terms)]
     for term in (*problem.terms, *others):
-        section = snake_case(type(term).__name__)
+        section, kind = term.section, type(term)
         for parameter in dataclasses.fields(term):
             value = getattr(term, parameter.name)
             if isinstance(value, float) and np.isfinite(value):
-                known[f"terms.{section}.{parameter.name}"] = ("terms", (type(term), parameter.name), value)
+                known[f"terms.{section}.{parameter.name}"] = ("terms", (kind, parameter.name), value)
     sections = {f"terms.{snake_case(kind.__name__)}": kind for kind in TERMS}
     section, _, key = str(name).rpartition(".")
     if name not in known and key in getattr(sections.get(section), "__dataclass_fields__", ()):

@@ -204,7 +204,7 @@ class Outcome(Generic[Program]):
         both, ended = self.then(new, name), new.usable or new.result.status is Status.INTERRUPTED
         if ended or not rank_of(self.result) < rank_of(new.result):
             return both
-        attempts = (*self.attempts, replace(new.attempt(name), kept=False))
+        attempts = (*self.attempts, replace(both.attempts[-1], kept=False))
         return replace(self, result=with_effort_of(self.result, both.result), attempts=attempts)
 
     def checked(self) -> Outcome[Program]:

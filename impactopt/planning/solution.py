@@ -18,7 +18,13 @@ from impactopt.errors import counted
 from impactopt.planning.bounds import Cause
 from impactopt.planning.contact_replay import SOLVED_WITHIN, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gain_selection import ChosenGains
-from impactopt.planning.lazy_constraints import gear_caution, lazy_terms_of, meets_again, slide, slide_caution
+from impactopt.planning.lazy_constraints import (
+    gear_caution,
+    lazy_terms_of,
+    slide,
+    slide_caution,
+    touch_caution,
+)
 from impactopt.planning.refinement import Attempt, Outcome
 from impactopt.problem.feasibility import overlapping
 from impactopt.problem.problem import ImpactProblem
@@ -260,7 +266,7 @@ class Solution(Solved):
         plan.
         """
         planned = [self.plan.collision, *(scenario.collision for scenario in self.plan.scenarios)]
-        if self.contact_error is None or self.contact_error.missed or not self.contact_error.finer:
+        if self.contact_error is None or not self.contact_error.finer:
             return planned
         finer = zip(self.contact_error.finer, planned, strict=True)
         return [replace(new, outcome=old.outcome) for new, old in finer]
@@ -292,7 +298,7 @@ class Solution(Solved):
         expected, *others = self._collisions
         out: dict[str, Any] = {
             **self.outcome(),
-            **impact_summary(plan, expected),
+            **impact_summary(plan, expected, self.contact_replay),
             "objectives": dict(self.objectives),
             "motion_price_pct": self.motion_price_pct,
             "duration_s": plan.duration,
@@ -325,20 +331,25 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        slides, again = slide_caution(self.problem, self.slide), meets_again(self.problem, plan)
+        slides, again = slide_caution(self.problem, self.slide), touch_caution(self.problem, plan)
         cautions = (out.get("caution"), again, slides, self.window, overlapping(self.problem))
         if caution := " ".join(filter(None, cautions)):
             out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *replayed])
 
 
-def impact_summary(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
+def impact_summary(
+    hit: Plan | PlannedStrike, collision: PlannedCollision, replay: ContactReplay | None
+) -> dict[str, Any]:
     """Entries of ``summary.json`` for a planned impact; one without duration has no force."""
-    duration = hit.compression + hit.restitution
+    duration, peak = hit.compression + hit.restitution, collision.peak_force
+    # the force between the program's points, where no finer mesh has it
+    if collision is hit.collision and replay is not None and not replay.unforeseen:
+        peak = replay.peak
     return {
         "impulse_Ns": hit.impulse,
         "target": collision.outcome,
-        "peak_force_N": collision.peak_force if duration > 0 else None,
+        "peak_force_N": peak if duration > 0 else None,
         "contact_ms": 1e3 * hit.collision.last_touch if duration > 0 else 0.0,
         "hand_speed_m_s": hit.hand_speed,
     }

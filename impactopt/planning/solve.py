@@ -55,6 +55,7 @@ from impactopt.transcription.transcription import Transcription, statement_of
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
 _HOPELESS_ITERATIONS = 100  # of each program of a problem that is unlikely to have a solution
+_SAME_POSTURE = 1e-6  # [rad], [m] largest difference of a coordinate
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 
 
@@ -138,8 +139,7 @@ def solve(
     if problem.floats and isinstance(start, str) and start == "strike":
         raise InputError(f"robot {problem.robot.name!r} floats freely, and has no strike: start from 'reach'")
     one = partial(_planned, seed, refine)
-    best = best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
-    return with_limits_kept(best) if refine else best
+    return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
 
 
 def _planned(
@@ -174,7 +174,9 @@ def _planned(
     # A solution of a similar problem is more than an estimate, so with one all iterations are allowed.
     outcome = _best(guesses, len(which), solver, doubted=bool(doubts) and not isinstance(given, SolverResult))
     violated = ended_with_violations(outcome.program, outcome.result)
-    if isinstance(given, str) and given == "reach" and violated and not doubts and not budget.is_over():
+    reach = isinstance(given, str) and given == "reach" and not doubts
+    # Of starts on several processes, the first alone tries it: it is the same posture for all.
+    if reach and violated and which.start == 0 and not budget.is_over():
         outcome = _else_from_other_posture(t, outcome, solver)
     if refined and margins is None:
         outcome = solver.on(outcome)
@@ -191,6 +193,7 @@ def _planned(
     # Fixing the gains has solved again, at the nodes alone.
     again = margins if gains and refined else None
     outcome = BetweenNodes(budget, again).checked(outcome)
+    outcome = _with_limits_kept(outcome) if refined else outcome
     usable = outcome.usable
     return solution_of(
         outcome,
@@ -244,7 +247,9 @@ class PlanSolver:
         """Outcome of an initial guess, with the lazy constraints and the prices of motion that it needs."""
         # Prices last: each reduction changes the motion, and the lazy terms are checked again.
         oracles: list[Oracle[Transcription]] = [LazyTerms(self.budget.report), MotionPrice()]
-        return refine(self._solved(guess), oracles, self._solved, self.budget)
+        outcome = refine(self._solved(guess), oracles, self._solved, self.budget)
+        # before starts are compared
+        return _with_limits_kept(outcome) if self.refined else outcome
 
     def on(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
         """Solution refined between its nodes, which `from_guess` has not done without clearance
@@ -305,6 +310,17 @@ class PlanSolver:
         return stuck.then(found) if found.usable else found.then(stuck)
 
 
+def _with_limits_kept(outcome: Outcome[Transcription]) -> Outcome[Transcription]:
+    """Outcome whose status is acceptable if its plan loses limits between nodes (`with_limits_kept`)."""
+    t, at = outcome.program, outcome.at
+    # the robot's own gains are not those of the plan while these are open
+    if outcome.result.status is not Status.SOLVED or t.problem.gains:
+        return outcome
+    error, hit = at.contact_error, at.planned.collision
+    hit = error.finer[0] if error is not None and error.finer else hit
+    return replace(outcome, result=with_limits_kept(outcome.result, at.planned, hit, t.problem.robot))
+
+
 def _best(
     guesses: Callable[[PlanSolver], Guesses[Transcription]], count: int, solver: PlanSolver, *, doubted: bool
 ) -> Outcome[Transcription]:
@@ -337,9 +353,10 @@ def _else_from_other_posture(
     """
     p, used = t.problem, strongest_posture(t.problem)
     posture = p.contact_posture
-    if np.array_equal(posture, used):
+    # Postures come of iterations: equal ones differ in their last digits.
+    if np.allclose(posture, used, atol=_SAME_POSTURE):
         posture = drawn_posture(p)
-    if np.array_equal(posture, used):
+    if np.allclose(posture, used, atol=_SAME_POSTURE):
         return outcome
     solver.budget.say("no motion was found: solving again from another posture at contact")
     guess = Guess(program=t, start=first_iterate(t, posture=posture))

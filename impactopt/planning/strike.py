@@ -67,7 +67,7 @@ class StrikeSolution(Solved):
         angles = self.problem.robot.joint_positions(hit.posture)
         return {
             **self.outcome(),
-            **impact_summary(hit, hit.collision),
+            **impact_summary(hit, hit.collision, self.contact_replay),
             "objectives": dict(self.objectives),
             **hit.margins(),
             **loads.summary(),

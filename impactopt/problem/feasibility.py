@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from impactopt.bodies.clearance import Places, Touch
-from impactopt.contact.fields import snake_case
 from impactopt.contact.targets import Nail
 from impactopt.errors import InputError, counted
 from impactopt.kinematics.inverse_kinematics import Reach, inverse_kinematics, reach
@@ -152,16 +151,20 @@ def unusual(problem: ImpactProblem) -> list[str]:
 
 
 def without_effect(problem: ImpactProblem) -> list[str]:
-    """Messages about terms that bound nothing, as the robot stands on no soles."""
-    if problem.soles:
-        return []
+    """Messages about tolerances of a collision model that is not chosen, and about terms that bound nothing,
+    as the robot stands on no soles.
+    """
+    out = [
+        f'[collision] {name} has no effect: it is of model = "auto"'
+        for name in ("auto_impulse_pct", "auto_zmp_mm")
+        if problem.collision != "auto" and getattr(problem, name) != getattr(type(problem), name)
+    ]
     kinds = (Balance, ContactWrenchCone, GroundForce, LegExtension)
     given = [term for term in problem.terms if isinstance(term, kinds) and term not in DEFAULT_TERMS]
-    return [
-        f"[terms.{snake_case(type(term).__name__)}] has no effect: it is of soles on the ground, and none "
-        "stands there"
+    return out + [
+        f"[terms.{term.section}] has no effect: it is of soles on the ground, and none stands there"
         for term in given
-        if getattr(term, "enabled", True)
+        if not problem.soles and getattr(term, "enabled", True)
     ]
 
 

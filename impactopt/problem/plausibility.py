@@ -9,10 +9,10 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.bodies.convex_hulls import FAR, LEAST_DENSITY, distance_to_link, inertia_sides, is_far, size_of
-from impactopt.bodies.file_shapes import lost_meshes, malformed_shapes
+from impactopt.bodies.file_shapes import lost_meshes, malformed_shapes, shapes_of
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.solids import NOT_FOUND
-from impactopt.errors import counted
+from impactopt.errors import FARTHEST, counted
 from impactopt.robots.gains import HEAVIEST_ROTOR, LIGHTEST_ROTOR
 from impactopt.robots.robot import Robot
 
@@ -159,7 +159,7 @@ def shape_doubts(robot: Robot) -> Iterator[str]:
     larger than the robot, and striking links without shapes.
     """
     yield from _lost_meshes(robot)
-    yield from _malformed_shapes(robot)
+    yield from _shapes_left_out(robot)
     bodies = bodies_of(robot)
     for piece in bodies.too_large:
         yield (
@@ -212,8 +212,8 @@ def _lost_meshes(robot: Robot) -> Iterator[str]:
         )
 
 
-def _malformed_shapes(robot: Robot) -> Iterator[str]:
-    """Messages about shapes that are left out, as their numbers cannot be read; each once of a link."""
+def _shapes_left_out(robot: Robot) -> Iterator[str]:
+    """Messages about shapes that are left out, as they cannot be read or are too far; each once of a link."""
     for link, element in dict.fromkeys(
         (link, ElementTree.tostring(element, encoding="unicode").strip())
         for link, element in malformed_shapes(robot.urdf)
@@ -221,6 +221,16 @@ def _malformed_shapes(robot: Robot) -> Iterator[str]:
         yield (
             f"a shape of link {link!r} is left out, as its kind is unknown, or its numbers are missing, no "
             f"numbers or negative: {element}; correct it"
+        )
+    shapes = (
+        shape
+        for kind in ("collision", "visual")
+        for shape in shapes_of(robot.model, robot.urdf, kind, far=True)
+    )
+    for link in dict.fromkeys(shape.link for shape in shapes):
+        yield (
+            f"a shape of link {link!r} is left out, as it reaches more than {FARTHEST:g} m from the link's "
+            "joint: correct its <origin>, its size or its mesh's scale"
         )
 
 

@@ -284,9 +284,12 @@ class Simulation:
         ------
         InputError : the target was not hit, though there was one and the engine fixes the soles.
         """
-        hit = bool(np.isfinite(self.contact_start))
-        if not hit and self.fall is None and not self.missed:
+        if np.isnan(self.contact_start) and self.fall is None and not self.missed:
             raise InputError("the simulated motion never touched the target")
+        return self._summary(torque_limit, polygon, planned_impulse)
+
+    def _summary(self, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
+        hit = bool(np.isfinite(self.contact_start))
         known = bool(np.isfinite(self.clearance))
         # without contact, the motion is divided at the planned one
         phase = self.phase() if hit else (self.time >= self.expected).astype(int)
@@ -384,12 +387,13 @@ class Simulation:
         }
 
     def report(self, *, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
-        """Summary as `impactopt validate --json` prints it, with the worst value of all phases.
+        """Summary as `impactopt validate --json` prints it, with the worst value of all phases; also of a
+        target that was not hit, whichever the engine.
 
         ``zmp_margin_m`` is the least, ``torque_ratio`` the largest; ``zmp_margin_by_phase_m`` and
         ``torque_ratio_by_phase`` are those of `summary`.
         """
-        given = self.summary(torque_limit=torque_limit, polygon=polygon, planned_impulse=planned_impulse)
+        given = self._summary(torque_limit, polygon, planned_impulse)
         margins, ratios = given.get("zmp_margin_m", {}), given["torque_ratio"]
         given["zmp_margin_m"] = min(margins.values(), default=None)
         given["torque_ratio"] = max(ratios.values())

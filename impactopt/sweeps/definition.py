@@ -46,6 +46,8 @@ from impactopt.sweeps.sections import (
 )
 from impactopt.sweeps.table import PLAN_COLUMNS, PLAN_PREFIXES
 
+_TRIED_CASES = 8  # at most, for a problem that can be built
+
 
 class VariedKeys:
     """Reader of the varied keys, which adds what is wrong with them to a list of mistakes.
@@ -258,18 +260,21 @@ class Sweep:
 
     @cached_property
     def built(self) -> ImpactProblem:
-        """The problem without varied keys; if only these complete it, that of the first case.
+        """The problem without varied keys; if only these complete it, that of the first case that can be
+        built, of a few from the whole design.
 
         Raises
         ------
-        InputError : neither can be built.
+        InputError : none can be built.
         """
         try:
             return self.problem.build()
         except InputError as error:
-            first = {key: values[0] for key, values in self.design.columns(0, 1).items()}
-            with contextlib.suppress(InputError):
-                return self.problem.changed(first).build()
+            # a sweep may have a million cases, of which each is tried for a second
+            for k in np.unique(np.linspace(0, self.design.cases - 1, _TRIED_CASES).astype(int)).tolist():
+                case = {key: values[0] for key, values in self.design.columns(k, k + 1).items()}
+                with contextlib.suppress(InputError):
+                    return self.problem.changed(case).build()
             raise error
 
     @cached_property

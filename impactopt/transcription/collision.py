@@ -783,7 +783,8 @@ class Collision(ContactParameters):
         own = slice(start, start + len(self.stages))
         torque = outputs["collision"][own, b.parts("collision")["torque"]]
         speed = outputs["force"][own, b.parts("force")["speed"][0]]
-        outcome, tangential = target.outcome(self.state.read(x)[-1], self.target), None
+        state = self.state.read(x)[-1]
+        outcome, tangential = target.outcome(state, self.target), None
         if self.tangential.size:
             tangential = np.vstack([np.zeros(3), self.tangential.read(x)])
             outcome |= tangential_outcome(tangential[-1])
@@ -797,5 +798,6 @@ class Collision(ContactParameters):
             ground=total_ground_wrench(b.coordinates, wrench),
             outcome=outcome,
             tangential_velocity=tangential,
+            target_state=state,
             **self._joints(x, type(b.problem.law)(**self.law)),
         )

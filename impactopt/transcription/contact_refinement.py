@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
+from impactopt.contact.targets.base import Target
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, RESTITUTING
@@ -43,13 +44,15 @@ class ContactError:
     """Discretization error of a plan's contact, the largest over its targets.
 
     pct : error of the impulse [%]; inf if an event is missed, or the finer contact was not found.
-    coarse : the part of it [%] that longer elements cause. The rest comes from phases that keep to one branch
-        of the law.
+    coarse : the part of it [%] that longer elements cause, or what they change of the momentum across the
+        normal that friction gives the target, over the impulse, if that is more. The rest comes from phases
+        that keep to one branch of the law.
     of_elements : contribution of each element of each phase to `coarse` [%].
     missed : an event is missed.
     strained : by phase and element, a gear carries more than it may between the plan's collocation points.
     finer : the collisions on elements half as long, in the program's order, as torque and ZMP may be worse
-        between the plan's points. Empty if they were not found.
+        between the plan's points. Empty if they were not found, or are other contacts as an event is
+        missed.
     """
 
     pct: float
@@ -76,18 +79,21 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
     approach = approaches(t.program.outputs(x))
     for new, old in zip(contact.hit.lasting, t.hit.lasting, strict=True):
         finer.append(new.decode(by_phases, outputs, approach))
-        coarse.append(_impulse_error(new, old, by_phases, x))
-        of_elements.append(_element_errors(new, old, by_phases, x))
+        of_element = _element_errors(new, old, by_phases, x, t.problem.target)
+        across = float(np.linalg.norm(of_element[:, 1:].sum(axis=0)))
+        coarse.append(max(_impulse_error(new, old, by_phases, x), across, key=abs))
+        of_elements.append(np.linalg.norm(of_element, axis=1))
         errors.append(_impulse_error(new, old, by_law, x))
     ends = np.cumsum([len(phase) for phase in t.hit.elements])[:-1]
+    missed = bool(np.isinf(errors).any())
     strained = np.any([_strained(t, hit, contact.hit.stages) for hit in finer], axis=0)
     return ContactError(
         pct=max(errors, key=abs),
         coarse=max(coarse, key=abs),
         of_elements=tuple(tuple(map(float, phase)) for phase in np.split(np.max(of_elements, axis=0), ends)),
-        missed=bool(np.isinf(errors).any()),
+        missed=missed,
         strained=tuple(tuple(map(bool, phase)) for phase in np.split(strained, ends)),
-        finer=tuple(finer),
+        finer=() if missed else tuple(finer),
     )
 
 
@@ -273,16 +279,22 @@ def _scale(old: Collision, x: Array) -> float:
     return 100 / max(abs(float(old.p.read(x)[-1, 0])), 1e-9)
 
 
-def _element_errors(new: Collision, old: Collision, z: Array, x: Array) -> Array:
-    """Contribution (elements,) of each element to the error of the impulse [%]."""
-    planned, found = old.p.read(x)[:, 0], new.p.read(z)[:, 0]
+def _element_errors(new: Collision, old: Collision, z: Array, x: Array, target: Target) -> Array:
+    """Contributions (elements, 1 or 4) of each element to the error of the impulse [%], and of the momentum
+    across the normal of a target that friction moves.
+    """
+    mass = target.tangential_mass(old.target) or 0.0
+    planned, found = (
+        np.hstack([hit.p.read(values), mass * hit.tangential.read(values)])
+        for hit, values in ((old, x), (new, z))
+    )
     ends = [
-        float(found[i] - planned[k])
+        found[i] - planned[k]
         for i, k in same_places(new.stages, old.stages)
         # Radau's last stage is the element's end, which both meshes have, as elements are halved
         if k == old.stages[k].members[-1]
     ]
-    return np.asarray(np.abs(np.diff([0.0, *ends])) * _scale(old, x))
+    return np.diff(ends, axis=0, prepend=0.0) * _scale(old, x)
 
 
 def _impulse_error(new: Collision, old: Collision, z: Array, x: Array) -> float:

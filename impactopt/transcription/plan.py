@@ -319,6 +319,7 @@ class PlannedCollision:
         collocation point.
     force (m + 1,), forces (m + 1, strikers) : [N] total contact force, and that on each striker.
     target_speed (m + 1,) : of the target's surface [m/s].
+    target_state (n_states,) : of the target at the end; (0,) for an impact without duration.
     tangential_velocity (m + 1, 3) : [m/s] across the normal, of a target that friction moves; else None.
     outcome : effect on the target, by name and unit (``speed_m_s`` of a free mass, ``depth_m`` of a nail,
         ``broken`` of a board, ``tangential_speed_m_s`` if friction moves it across the normal).
@@ -343,6 +344,7 @@ class PlannedCollision:
     acceleration: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     forces: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     tangential_velocity: Array | None = field(default=None, repr=False)
+    target_state: Array = field(default_factory=lambda: np.zeros(0), repr=False)
 
     def aside(self, since: Array) -> Array:
         """Displacement (k, 3) [m] of the target across the normal at times (k,) [s] since contact.

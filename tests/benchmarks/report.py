@@ -95,11 +95,11 @@ def columns_table(title: str, columns: Sequence[Column], rows: Sequence[Mapping[
 
 
 def cell(value: Any, digits: int | str) -> str:
-    """A number, or yes or no, as a table has it; text stays as it is; "-" for what there is not.
+    """A number, or yes or no, as a table has it; text stays as it is; "-" for None and nan.
 
     digits : behind the point, or a format.
     """
-    if value is None:
+    if value is None or value != value:  # nan
         return "-"
     if isinstance(value, str):
         return value

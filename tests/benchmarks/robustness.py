@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.pictures.robustness import robustness_picture
 from benchmarks.planning import DEMO, controller_in, plan_of
-from benchmarks.report import Report, Say, make_table
+from benchmarks.report import Report, Say, cell, make_table
 from impactopt.simulation import Perturbation, Simulation
 from impactopt.simulation.robustness import STEP, PerturbationRanges, Robustness, robustness
 
@@ -100,7 +100,7 @@ def tables_of(result: Robustness, title: str, nominal: Simulation) -> tuple[Any,
     stands = f"{int(result.standing.sum())} of {result.draws}"
     rows = [
         ["stand", f"{stands}: {100 * result.rate:.0f} % (95 %: {100 * low:.0f} to {100 * high:.0f})"],
-        ["impulse [N s]", f"{result.impulse_mean:.2f} +- {result.impulse_std:.2f}"],
+        ["impulse [N s]", f"{cell(result.impulse_mean, 2)} +- {cell(result.impulse_std, 2)}"],
         ["planned [N s]", f"{result.planned_impulse:.2f}"],
         ["as planned", f"{nominal.fall or 'stands'}, {nominal.impulse:.2f} N s"],
         *([reason, str(count)] for reason, count in result.reasons().items()),
@@ -112,8 +112,8 @@ def tables_of(result: Robustness, title: str, nominal: Simulation) -> tuple[Any,
         [
             name,
             *("-" if np.isnan(x) else f"{100 * x:.0f} %" for x in shares),
-            *(f"{means[name][key]:.3f}" for key in ("stands", "falls")),
-            f"{means[name]['apart']:+.2f}",
+            *(cell(means[name][key], 3) for key in ("stands", "falls")),
+            cell(means[name]["apart"], "+.2f"),
         ]
         for name, shares in ordered
     ]

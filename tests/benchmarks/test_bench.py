@@ -23,7 +23,15 @@ from benchmarks import replay, robustness, truth
 from benchmarks.__main__ import app
 from benchmarks.registry import BENCHES, run_bench
 from benchmarks.report import Report, columns_table, make_table, save_report
-from impactopt import ImpactProblem, InputError, Solution, Status
+from impactopt import (
+    ImpactProblem,
+    InputError,
+    PerturbationRanges,
+    Robustness,
+    Solution,
+    Status,
+    draw_perturbations,
+)
 from impactopt.files.problem_file import ProblemFile
 from impactopt.simulation import Simulation
 
@@ -77,6 +85,24 @@ def test_robustness_says_how_many_stand_and_keeps_every_draw() -> None:
     assert numbers["impulse_std_Ns"] == pytest.approx(np.std(numbers["rows"]["impulse_Ns"]))
     assert {len(column) for column in numbers["rows"].values()} == {2}
     assert sum(numbers["reasons"].values()) == 2 - numbers["standing"]
+
+
+@pytest.mark.parametrize("stand", [True, False])
+def test_a_table_of_draws_that_all_stand_or_all_fall_has_no_nan(stand: bool) -> None:
+    """There is no mean of those that fall, or stand."""
+    found = Robustness(
+        perturbations=draw_perturbations(2),
+        drawn_from=PerturbationRanges(),
+        standing=np.full(2, stand),
+        reason=("" if stand else "diverged",) * 2,
+        impulse=np.full(2, 14.0 if stand else np.nan),
+        slip=np.zeros(2),
+        lift=np.zeros(2),
+        planned_impulse=14.0,
+    )
+    tables = robustness.tables_of(found, "punch", still_solution().validate())
+    cells = [cell for table in tables for column in table.columns for cell in column.cells]
+    assert "-" in cells and not any("nan" in str(cell) for cell in cells)
 
 
 def test_the_robust_problem_is_measured_where_there_is_one_and_solved(

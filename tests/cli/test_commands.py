@@ -85,12 +85,19 @@ def test_check_lists_every_mistake(file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_check_doubts_terms_that_bound_nothing(file: Path) -> None:
-    given = ("terms.balance.angular_momentum=3", "terms.contact_wrench_cone.margin=0.01")
+def test_check_doubts_settings_that_have_no_effect(file: Path) -> None:
+    given = (
+        "terms.balance.angular_momentum=3",
+        "terms.contact_wrench_cone.margin=0.01",
+        "collision.auto_zmp_mm=1",
+    )
     arguments = [word for setting in given for word in ("--set", setting)]
     doubts = " ".join(json.loads(run("check", file, "--json", *arguments)[0])["doubts"])
     for name in ("balance", "contact_wrench_cone"):
         assert f"[terms.{name}] has no effect: it is of soles on the ground" in doubts
+    assert "[collision] auto_zmp_mm has no effect" in doubts and "auto_impulse_pct" not in doubts
+    auto = json.loads(run("check", file, "--json", *arguments, "--set", "collision.model=auto")[0])
+    assert "auto_zmp_mm" not in " ".join(auto["doubts"])
 
 
 def test_verbose_shows_where_an_error_is_from(file: Path) -> None:

@@ -24,6 +24,7 @@ from impactopt import (
     FreeMass,
     FullDynamics,
     GearLoad,
+    Impulse,
     Incidence,
     InputError,
     KelvinVoigt,
@@ -358,3 +359,23 @@ def test_a_file_has_it_and_a_target_that_is_held_keeps_its_hash() -> None:
     assert "moves_target" not in problem_data(held)["friction"]
     again = problem_from_data(data, where="again.toml")
     assert again.friction == moves.friction and again.hash == moves.hash != held.hash
+
+
+@pytest.mark.slow
+def test_a_plans_mesh_has_the_momentum_that_friction_gives_the_target() -> None:
+    """Bristles swing within the contact: on the mesh that the impulse needs the speed was off by 6 %."""
+    normal = np.array([0.15, 0.0, -np.sqrt(1 - 0.15**2)])
+    rough = ContactFriction(coefficient=0.8, slip_speed=0.02, stiffness=2e4, moves_target=True)
+    solution = solve(
+        dataclasses.replace(
+            load_problem("arm_planar"),
+            normal=normal,
+            target=FreeMass(mass=2.0),
+            law=SpringDamper(stiffness=2e4, damping=100.0),
+            friction=rough,
+            terms=(),
+            objectives=(Impulse(),),
+        )
+    )
+    replayed = solution.validate(step=2e-5).outcome["tangential_speed_m_s"]
+    assert solution.collision.outcome["tangential_speed_m_s"] == pytest.approx(replayed, rel=0.02)

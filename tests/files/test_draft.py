@@ -170,6 +170,16 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
             _drafted(tmp_path, text, motion=motion)
 
 
+@pytest.mark.slow
+def test_legs_that_hang_below_the_ground_when_bolted_are_told(tmp_path: Path) -> None:
+    """The message was only that no target is found. On a mount of a metre there is one."""
+    text = urdfs.biped(arms=False)
+    with pytest.raises(
+        InputError, match=r"'right_hand' hangs 0.88 m below the ground; place the root higher"
+    ):
+        _drafted(tmp_path, text, bolted=True)
+
+
 def test_an_arm_in_millimetres_has_no_posture_and_is_told_why(tmp_path: Path) -> None:
     def scaled(found: re.Match[str]) -> str:
         return f'{found[1]}="{" ".join(str(1e3 * float(x)) for x in found[2].split())}"'
@@ -453,6 +463,9 @@ def test_a_joint_without_a_motor_in_a_leg_of_seven_is_locked(tmp_path: Path) -> 
     problem = _problem(tmp_path, text)
     data = read_toml((tmp_path / "robot.toml").read_text())["robot"]
     assert data["locked_rad"] == {"left_tarsus": 0.0, "right_tarsus": 0.0}
+    # which the file does not say: an effort of 0 is as often one that nobody has filled in
+    (said,) = [line for line in _drafted(tmp_path, text).said if line.startswith("locked: ")]
+    assert "the file has no effort: else unlock it, with torque_limit_N_m (2 joints)" in said
     assert "torque_limit_N_m" not in data
     problem.robot.check_stance(problem.start_posture, tilt=1e-5)
 

@@ -12,6 +12,7 @@ import types
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 from urllib.error import HTTPError
 from urllib.parse import quote, urlsplit
 
@@ -45,6 +46,7 @@ from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
 from impactopt.files.replay import load_planned, problem_of, resumed
 from impactopt.live import plan_page as look_module
+from impactopt.live import replanning as replanning_module
 from impactopt.live.drawing import moment_of
 from impactopt.live.plan_page import PlanPage, plan_message
 from impactopt.live.replanning import Answer, Replanning
@@ -183,18 +185,34 @@ def test_a_stale_request_stops_the_solver(arm: Solution) -> None:
     assert replanning.latest is arm
 
 
-def test_a_plan_of_another_program_is_solved_from_the_last(
-    arm: Solution, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("other_program", [True, False])
+def test_what_is_not_replanned_is_solved(
+    arm: Solution, monkeypatch: pytest.MonkeyPatch, other_program: bool
 ) -> None:
-    def refused(self: Solution, **_: object) -> Solution:
-        raise InputError("the program has other constraints then")
+    """From the latest plan if that has another program; from a reach if it is too far to go on from: of a
+    mass four times as heavy there was no plan in time.
+    """
+    replanning, starts = Replanning(arm), list[object]()
 
-    monkeypatch.setattr(Solution, "moved", refused)
-    request = request_of(arm.problem)
+    def fails(*_: object, **__: object) -> Solution:
+        if other_program:
+            raise InputError("the program has other constraints then")
+        return dataclasses.replace(arm, result=dataclasses.replace(arm.result, status=Status.TIME_LIMIT))
+
+    def solved(*given: Any, start: Any, **options: Any) -> Solution:
+        starts.append(start)
+        return solve(*given, start=start, **options)
+
+    monkeypatch.setattr(replanning_module, "moved_solution", fails)
+    monkeypatch.setattr(replanning_module, "solve", solved)
     mass = 1.1 * arm.problem.target.mass
-    answer = Replanning(arm)(dataclasses.replace(request, parameters=(("mass", mass),)), lambda: False)
+    request = dataclasses.replace(request_of(arm.problem), parameters=(("mass", mass),))
+    answer = replanning(request, lambda: False)
+    assert starts == [arm if other_program else "reach"]
     assert answer.solution is not None
     assert answer.solution.problem.target.mass == mass
+    replanning(dataclasses.replace(request, parameters=(("mass", 1.1 * mass),)), lambda: False)
+    assert starts[1:] == [answer.solution]
 
 
 def test_the_motion_plays_and_begins_again(look: PlanPage) -> None:
@@ -252,6 +270,7 @@ def test_the_largest_force_on_a_page_is_that_of_full_dynamics() -> None:
         peak = plan.validate().peak_force
         found = re.search(r"(\d+) N at most", plan_message(Answer(solution=plan), nail))
         assert found is not None and float(found[1]) == pytest.approx(peak, rel=5e-3)
+        assert plan.summary()["peak_force_N"] == pytest.approx(peak, rel=5e-3)
         assert plan.plan.collision.peak_force < 0.97 * peak
 
 

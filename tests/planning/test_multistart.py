@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from support.small_plans import Planned
 
 from impactopt import NotSolvedWarning, Status, load_problem, solve
+from impactopt.planning import multistart
 from impactopt.planning.budget import Budget
 from impactopt.planning.multistart import best_of
 from impactopt.planning.refinement import Guess, Outcome
+from impactopt.solvers.program import SolverResult
 from impactopt.transcription.transcription import Transcription
 
 DEEP = "Bodies penetrate each other by {:.1f} mm, and no motion was found in which they do not: {}."
@@ -88,3 +91,28 @@ def test_a_limit_of_iterations_is_of_all_programs_of_each_start() -> None:
         solution = solve(load_problem("arm7"), options={"max_iterations": 10}, starts=2)
     assert solution.status is Status.ITERATION_LIMIT
     assert [attempt.iterations for attempt in solution.attempts] == [10, 10]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_start_that_loses_a_limit_goes_after_one_that_keeps_all(
+    monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    """Only the best of all starts was checked, and was kept as acceptable beside solved ones."""
+    arm = load_problem("arm7")
+
+    def lost(result: SolverResult, *_: object) -> SolverResult:
+        return (
+            replace(result, status=Status.ACCEPTABLE, message="lost") if result.objective < limit else result
+        )
+
+    def each(one: Any, shared: Any, jobs: Any, **_: Any) -> Iterator[Any]:
+        for k, start in jobs:
+            yield k, one(shared, start)
+
+    monkeypatch.setattr(multistart, "each_on_workers", each)  # the same process, which knows what is lost
+    first, second = sorted(solve(arm, starts=2).attempts, key=lambda a: a.objective)
+    limit = (first.objective + second.objective) / 2
+    monkeypatch.setattr("impactopt.planning.solve.with_limits_kept", lost)
+    again = solve(arm, starts=2, workers=workers)
+    assert again.status is Status.SOLVED and again.result.objective == pytest.approx(second.objective)

@@ -117,3 +117,28 @@ def test_what_cannot_go_to_processes_is_told(arm: ImpactProblem, monkeypatch: py
     own = replace(arm, law=Local(**{name: getattr(arm.law, name) for name in arm.law.parameters}))
     with pytest.raises(InputError, match=r"cannot go to other processes.*workers=1"):
         optimize_strike(own, starts=2, workers=2)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::impactopt.NotSolvedWarning")
+def test_another_posture_is_tried_once_whatever_starts_fail(
+    arm: ImpactProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each failed start of its own process tried it, and took as long again."""
+
+    def each(one: Any, shared: Any, jobs: Any, **_: Any) -> Iterator[Any]:
+        run, budget, ends = shared
+        for k, start in jobs:
+            yield k, one((run, replace(budget, report=told.append), ends), start)
+
+    def drawn(problem: ImpactProblem) -> Any:
+        return problem.contact_posture + 0.05
+
+    told: list[str] = []
+    monkeypatch.setattr(multistart, "each_on_workers", each)
+    quick = replace(arm, swing=replace(arm.swing, duration=(0.1, 0.15)))
+    assert solve(quick, starts=2, workers=2).status is Status.INFEASIBLE
+    assert not any("another posture" in line for line in told), "this arm has one posture"
+    monkeypatch.setattr("impactopt.planning.solve.drawn_posture", drawn)
+    assert solve(quick, starts=2, workers=2).status is Status.INFEASIBLE
+    assert sum("another posture" in line for line in told) == 1

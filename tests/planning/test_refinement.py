@@ -107,13 +107,22 @@ def test_a_joint_beyond_its_limit_between_nodes_makes_a_plan_acceptable(
     used = {"velocity": t.v, "torque": t.torque}[limit][:, robot.joint_index("elbow")]
     lower = np.array(getattr(robot, f"{limit}_limit"))
     lower[robot.joint_index("elbow")] = np.abs(used).max() / 1.05
-    weaker = replace(
-        hammered, problem=replace(hammered.problem, robot=replace(robot, **{f"{limit}_limit": lower}))
-    )
-    assert with_limits_kept(hammered) is hammered
-    found = with_limits_kept(weaker)
+    weaker = replace(robot, **{f"{limit}_limit": lower})
+    given = hammered.result, hammered.plan, hammered.collision
+    assert with_limits_kept(*given, robot) is hammered.result
+    found = with_limits_kept(*given, weaker)
     assert found.status is Status.ACCEPTABLE
-    assert f"elbow has 1.05 times its {limit} limit" in found.result.message
+    assert f"elbow has 1.05 times its {limit} limit" in found.message
+
+
+def test_an_attempt_that_fails_worse_is_listed_too() -> None:
+    """Its iterations were counted, and it was in no table."""
+    first = solved(Guess(program=PROGRAM, start=np.array([0.0, FAILS])))
+    first = replace(first, attempts=(first.attempt("reach 1"),))
+    worse = replace(first, result=replace(first.result, max_violation=2.0))
+    found = first.else_then(worse, "other posture")
+    assert [(a.start, a.kept) for a in found.attempts] == [("reach 1", True), ("other posture", False)]
+    assert found.result.max_violation == 1.0 and found.result.iterations == 20
 
 
 def test_the_effort_of_all_guesses_and_rounds_is_counted() -> None:

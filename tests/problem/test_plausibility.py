@@ -164,6 +164,18 @@ def test_a_malformed_place_of_a_shape_is_told(tmp_path: Path) -> None:
     assert "shoulder_link" in line and '<origin xyz="0.15" />' in line
 
 
+@pytest.mark.parametrize("xyz", ["0 0 150", "0 0 1500", "0 0 1e200"])
+def test_a_shape_far_from_its_link_is_told(tmp_path: Path, xyz: str) -> None:
+    """One beyond a kilometre was left out without a word."""
+    text = urdfs.arm().replace(
+        '<collision><origin xyz="0.0 0.0 0.15"/>', f'<collision><origin xyz="{xyz}"/>', 1
+    )
+    (tmp_path / "robot.urdf").write_text(text)
+    told = doubts(Robot.from_urdf(tmp_path / "robot.urdf", floating=False, armature=0.1))
+    (line,) = [line for line in told if line.startswith("a shape of link 'shoulder_link'")]
+    assert "correct its <origin>" in line and ("left out" in line) is (xyz != "0 0 150")
+
+
 @pytest.mark.parametrize(
     ("height", "doubted"), [("0.15", False), ("0.5", False), ("0.8", True), ("150", True)]
 )

@@ -14,7 +14,7 @@ import pinocchio as pin
 import pytest
 from matplotlib.colors import to_rgb
 from support.browser import DARK, WITHOUT_3D, Job, Visit, visit
-from support.fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_solution
+from support.fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_solution, strike_record
 from support.small_robots import biped
 from typer.testing import CliRunner
 
@@ -29,6 +29,7 @@ from impactopt import (
     TargetBody,
     load_problem,
     load_robot,
+    planar_arm,
 )
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.visuals import surroundings_of, visuals_of
@@ -502,9 +503,11 @@ def test_the_command_shows_robots_and_the_worlds_of_problems(
     assert done.exit_code == 0, done.output
     text = Reader(Path("mine.html").read_text(encoding="utf-8")).text
     assert "railcapsule 1 m long, radius 0.05 m(2, 2, 0.5) m" in text
+    save_record(strike_record(planar_arm(), *np.zeros((3, 3))), Path("strike"))
     for words, said in (
         (["planar_arn"], "planar_arm"),
         (["planar_arm", "--problem", str(file)], "--problem is for a result"),
+        (["strike", "--problem", str(file)], "--problem is for a whole motion"),  # was ignored
     ):
         done = runner.invoke(app, ["show", *words])
         assert done.exit_code == 2 and said in " ".join(done.output.split())

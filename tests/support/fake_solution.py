@@ -73,6 +73,7 @@ def still_plan(problem: ImpactProblem) -> Plan:
         force=np.array([700.0, 400.0, 300.0, 150.0, 0.0]),
         target_speed=IMPULSE / MASS * time / time[-1],
         outcome={"speed_m_s": IMPULSE / MASS},
+        target_state=np.array([IMPULSE / MASS]),
         torque=np.outer(np.linspace(0.1, 0.8, 5), problem.robot.torque_limit),
         ground=np.tile(ground, (4, 1)),
         sole_wrench=np.tile(wrench, (4, 1)),

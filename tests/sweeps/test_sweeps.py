@@ -177,7 +177,9 @@ def test_a_failure_is_a_row_with_its_reason_and_results_are_kept_on_demand(tmp_p
 
 @pytest.mark.slow
 def test_a_problem_that_only_a_varied_key_completes_is_swept(tmp_path: Path) -> None:
-    """No motor of the arm has a bound on its power, so the term alone is refused; each case has a limit."""
+    """No motor of the arm has a bound on its power, so the term alone is refused; each case has a limit. A
+    first case that is out of reach is a row with its reason, and no reason to refuse the sweep.
+    """
     problem = replace(load_problem("arm_planar"), terms=(PowerLimit(limit=1.0),))
     text = write_problem(problem).replace("limit_W = 1.0", "")
     (tmp_path / "arm.toml").write_text(text, "utf-8")
@@ -185,10 +187,13 @@ def test_a_problem_that_only_a_varied_key_completes_is_swept(tmp_path: Path) -> 
         load_problem(tmp_path / "arm.toml")
     given = {
         "sweep": {"problem": str(tmp_path / "arm.toml"), "case_kind": "strike"},
-        "grid": {"terms.power_limit.limit": [200.0, 1000.0]},
+        "list": {
+            "terms.power_limit.limit": [200.0, 200.0, 1000.0],
+            "problem.point_m": [[9.0, 0.0, 0.75], [0.7, 0.0, 0.75], [0.7, 0.0, 0.75]],
+        },
     }
-    weak, strong = rows(sweep(given, tmp_path / "out", workers=1).table)
-    assert weak["reason"] == strong["reason"] == ""
+    far, weak, strong = rows(sweep(given, tmp_path / "out", workers=1).table)
+    assert "out of reach" in far["reason"] and weak["reason"] == strong["reason"] == ""
     assert weak["impulse_Ns"] <= strong["impulse_Ns"]
 
 

@@ -248,6 +248,13 @@ def _bolted(
             data = {**_data(drafted, robot, [], strikers, q, folder), **hit.data}
             data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
         except InputError as no_target:
+            below = -float(striking_point(robot, arms[0].name, rested(robot))[2])
+            if below > 0:
+                raise InputError(
+                    f"{drafted.path}: no target is found: bolted with its root on the ground, the robot's "
+                    f"{arms[0].name!r} hangs {below:.2g} m below the ground; place the root higher in the "
+                    "file, such as by a fixed joint from a link `world`, or do not bolt a robot with legs"
+                ) from no_target
             if not why:
                 raise
             raise InputError(f"{drafted.path}: no strike of {arms[0].name!r} is found{why}") from no_target

@@ -26,7 +26,9 @@ from impactopt.robots.robot import Robot
 from impactopt.robots.urdf import read_urdf
 
 Array = NDArray[np.float64]
-FIXED = "fixed in the file"  # reason for which a joint is locked
+# reasons for which a joint is locked; many files have no effort of joints that have a motor
+FIXED = "fixed in the file"
+NO_MOTOR = "no motor, as the file has no effort: else unlock it, with torque_limit_N_m"
 SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may have another dot
 
 
@@ -128,7 +130,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if legs:
         _check_legs(found.robot, legs)
         extra = dict.fromkeys(toes(found.robot.model, legs, found.pieces), "a toe")
-        extra |= dict.fromkeys(_undriven(found, legs, extra), "no motor")
+        extra |= dict.fromkeys(_undriven(found, legs, extra), NO_MOTOR)
         locked = {**locked, **extra}
         carrying = {str(found.robot.model.names[j]) for leg in legs for j in leg.path} - extra.keys()
         if extra or carrying & found.drives.torque.keys():

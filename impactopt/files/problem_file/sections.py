@@ -87,7 +87,7 @@ class SolverSection(Section):
 
 _TERMS = {snake_case(kind.__name__): kind for kind in TERMS}
 _FIRST, *_, _LAST = list(_TERMS)[: len(DEFAULT_TERMS)]
-_LAZY = " and ".join(snake_case(type(term).__name__) for term in ON_DEMAND_TERMS)
+_LAZY = " and ".join(term.section for term in ON_DEMAND_TERMS)
 
 TermSections: Any = sections_of(
     "TermSections",

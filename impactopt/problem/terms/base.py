@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from impactopt.bodies.world import vector
-from impactopt.contact.fields import About, Described, abouts
+from impactopt.contact.fields import About, Described, abouts, snake_case
 from impactopt.errors import MOST, InputError, check_number, shortened
 
 _NO_METADATA = About(what="", least=0)  # of fields without metadata
@@ -107,6 +107,11 @@ class Term(Described):
         value = self._number("angle", getattr(self, "angle", None), About(what=""))
         if not 0 < value < np.pi / 2:
             raise InputError(f"{type(self).__name__}.angle is {value:g} rad; give one between 0 and pi/2")
+
+    @property
+    def section(self) -> str:
+        """Name of the term in problem files, such as ``torque_limit``."""
+        return snake_case(type(self).__name__)
 
     @property
     def active(self) -> bool:

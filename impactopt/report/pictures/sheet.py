@@ -43,12 +43,11 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
     chosen = _chosen(track)
     points = np.array([problem.point, *([] if problem.second is None else [problem.second.point])])
     solids, world = _solids(problem), [p for p in surroundings_of(problem.world) if not _hides(p)]
-    beside = [[p for p in world if not _covers(p, problem.normal, view)] for _, view in VIEWS]
     robots = [_joined([_placed(track, k, solid) for solid in solids]) for k in chosen]
     around = [_around(track, k, world, problem.normal) for k in chosen]
     # a stray vertex of a mesh may lie anywhere
     within = [np.percentile(robot[0].reshape(-1, 3), [0.05, 99.95], axis=0) for robot in robots]
-    edges = np.concatenate([*within, *(part[0].reshape(-1, 3) for parts in around for part in parts)])
+    edges = np.concatenate([*within, *(shown[0].reshape(-1, 3) for each in around for _, shown in each)])
     ends = np.array([edges.min(axis=0) - 0.04, edges.max(axis=0) + 0.04])
     ends[0, 2] = min(ends[0, 2], problem.ground_height or 0.0) - 0.02
     sizes = [[np.ptp(ends @ np.abs(direction)) for direction in view[:2]] for _, view in VIEWS]
@@ -59,7 +58,8 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
     for column, k in enumerate(chosen):
         for row, (name, view) in enumerate(VIEWS):
             ax = axes[row, column]
-            _draw(ax, *_joined([robots[column], *_around(track, k, beside[row], problem.normal)]), view)
+            beside = [shown for part, shown in around[column] if not _covers(part, problem.normal, view)]
+            _draw(ax, *_joined([robots[column], *beside]), view)
             ax.plot(*(points @ view[:2].T).T, "o", color=VERMILION, markersize=2, zorder=5)
             (left, right), (low, high) = (np.sort(ends @ direction) for direction in view[:2])
             ax.set(xlim=(left, right), ylim=(low, high), aspect="equal")
@@ -96,13 +96,14 @@ def _covers(part: Part, normal: Array, view: Array) -> bool:
     return float(np.ptp(part.solid.vertices @ view[:2].T, axis=0).min()) > LARGE
 
 
-def _around(track: Track, k: int, world: list[Part], normal: Array) -> list[Shown]:
-    """The world at an instant of a track."""
+def _around(track: Track, k: int, world: list[Part], normal: Array) -> list[tuple[Part, Shown]]:
+    """The parts of the world at an instant of a track."""
     shown = []
     for part in world:
         corners = part.placed(float(track.travel[k]), normal, track.aside[k])[part.solid.triangles]
         if abs(track.travel[k]) < MAX_TRAVEL or not part.moves:
-            shown.append((corners, _normals(corners), np.tile(to_rgb(PARTS[part.kind]), (len(corners), 1))))
+            colours = np.tile(to_rgb(PARTS[part.kind]), (len(corners), 1))
+            shown.append((part, (corners, _normals(corners), colours)))
     return shown
 
 

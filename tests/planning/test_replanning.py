@@ -234,6 +234,8 @@ def test_a_program_that_does_not_follow_is_built_anew(arm: Solution) -> None:
 def test_what_cannot_be_bent_is_said(arm: Solution) -> None:
     with pytest.raises(InputError, match=r"moved: a plan has no parameter 'masss' \(did you mean 'mass'\?\)"):
         arm.moved(masss=0.06)
+    with pytest.raises(InputError, match="moved: point: expected numbers, got 'here'"):
+        arm.moved(point="here")
     with pytest.raises(InputError, match="nothing is moved"):
         arm.moved()
     with pytest.raises(InputError, match=r"target\.mas.*target\.mass"):

@@ -208,6 +208,10 @@ def load_solution(
     Raises
     ------
     InputError : there is no result, it is damaged, or it is no plan of a motion.
+
+    Warns
+    -----
+    UserWarning : its own problem is another one today, as after a change of the robot's URDF.
     """
     from impactopt.files.replay import load_planned, resumed
 

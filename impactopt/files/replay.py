@@ -188,8 +188,8 @@ def load_planned(
         )
     if not (given or settings or _may_be_of(record, problem)):
         warnings.warn(
-            f"the problem of {result} is another one today, as after a change of its robot's files: robot, "
-            "target and limits are today's, the plan is the old one",
+            f"the problem of {result} is another one today than when it was planned, as after a change of its "
+            "robot's files: robot, target and limits are today's",
             stacklevel=3,
         )
     missed = _trajectory(record, "missed") if "missed_time" in a else None

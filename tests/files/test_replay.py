@@ -164,7 +164,7 @@ def test_a_problem_that_has_changed_since_its_plan_is_told(saved: Path, tmp_path
     text = PUNCH.read_text("utf-8").replace("mass_kg = 5.0", "mass_kg = 5.5")
     heavier = resaved(saved, tmp_path / "heavier", problem=text)
     with pytest.warns(
-        UserWarning, match="heavier is another one today, as after a change of its robot's files"
+        UserWarning, match="heavier is another one today .* after a change of its robot's files"
     ):
         assert not load_planned(heavier).of_other_problem
 

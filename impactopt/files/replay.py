@@ -188,7 +188,7 @@ def load_planned(
         )
     if not (given or settings or _may_be_of(record, problem)):
         warnings.warn(
-            f"the problem of {result} is another one today than when it was planned, as after a change of its "
+            f"the problem of {result} is another one today than it was planned for, as after a change of its "
             "robot's files: robot, target and limits are today's",
             stacklevel=3,
         )

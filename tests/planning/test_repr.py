@@ -1,5 +1,6 @@
 """What an interpreter prints of a result is a line, not its arrays."""
 
+import copy
 import sys
 
 import pytest
@@ -15,7 +16,10 @@ def test_a_solution_is_one_line(hammered: Solution) -> None:
     assert "planar_arm" in repr(solution.problem.robot) and len(repr(solution.problem.robot)) < 130
     for thing in (solution.trajectory, solution.plan.collision, solution.plan.motion()):
         assert type(thing).__name__ in repr(thing) and len(repr(thing)) < 130
-    assert len(repr(solution.validate())) < 600
+    simulation = solution.validate()
+    assert len(repr(simulation)) < 600
+    for thing in (solution.trajectory, solution.plan, solution.plan.collision, simulation):
+        assert len({thing, copy.copy(thing)}) == 2  # arrays neither compare nor hash
     p = solution.problem
     scene = {"robot": p.robot, "striker": p.striker, "normal": p.normal, "law": p.law}
     q = p.start_posture

@@ -147,11 +147,12 @@ class Solution(solution.Solution):
         return keep_record(record_of(self, problem=text), make_directory(directory))[0].parent
 
     def to_frame(self, *, missed: bool = False) -> Any:
-        """Planned motion as a pandas table, by time [s]: ``solution.to_frame()["q leg_left_4_joint"]``.
+        """Servo's reference as a pandas table, by time [s]: ``solution.to_frame()["q leg_left_4_joint"]``.
 
         Columns are phase (0 swing, 1 collision, 2 follow-through); position q [rad], velocity v, acceleration
-        a and torque [N m] of each joint; and force fx, fy, fz [N] and moment mx, my, mz [N m] of the ground
-        about the world's origin.
+        a and torque [N m] of each joint; and, of a robot on soles, force fx, fy, fz [N] and moment mx, my, mz
+        [N m] of the ground about the world's origin. In collision the reference coasts: the table is without
+        the impact's forces and what they change, which `collision` has.
 
         missed : the motion for a missed target, with the abort motion.
 
@@ -171,7 +172,8 @@ class Solution(solution.Solution):
         joints = {"q": angles, "v": t.v[:, -robot.n :], "a": t.a[:, -robot.n :], "torque": t.torque}
         for what, values in joints.items():
             columns |= {f"{what} {n}": c for n, c in zip(robot.joint_names, values.T, strict=True)}
-        columns |= {f"ground {n}": c for n, c in zip(GROUND, t.ground.T, strict=True)}
+        if self.problem.stands:  # else nothing is known of the force at a bolted base
+            columns |= {f"ground {n}": c for n, c in zip(GROUND, t.ground.T, strict=True)}
         return pandas.DataFrame(columns, index=pandas.Index(t.time, name="time [s]"))
 
     def export(
@@ -208,6 +210,10 @@ def load_solution(
     Raises
     ------
     InputError : there is no result, it is damaged, or it is no plan of a motion.
+
+    Warns
+    -----
+    UserWarning : its own problem is another one today, as after a change of the robot's URDF.
     """
     from impactopt.files.replay import load_planned, resumed
 

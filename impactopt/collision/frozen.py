@@ -37,7 +37,7 @@ from numpy.typing import ArrayLike
 
 from impactopt.codegen.cache import cached, model_hash
 from impactopt.errors import check_direction
-from impactopt.kinematics.stance import Stance, usual_stance
+from impactopt.kinematics.stance import Stance, stance_of
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 
@@ -397,9 +397,9 @@ def effective_mass(robot: Robot, *, striker: str, normal: ArrayLike, stance: Sta
     ------
     InputError : an unknown striker; a normal that is not a unit vector; a stance the robot cannot take.
     """
+    held_by = stance_of(robot, stance)
     frame = robot.striker(striker).model_frame
     n = check_direction("normal", normal)
-    held_by = usual_stance(robot) if stance is None else stance
 
     def build() -> list[Any]:
         frozen = FrozenDynamics(robot, held_by, frame, bias=False, jdot=False)

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.outputs import HISTORIES, OUTPUTS, SCALARS
 from impactopt.contact import ContactLaw, Target
-from impactopt.errors import InputError, check_direction, check_kind, check_positive
-from impactopt.kinematics.stance import Stance, usual_stance
+from impactopt.errors import InputError, check_direction, check_positive
+from impactopt.kinematics.stance import Stance, stance_of
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -146,11 +146,8 @@ class CollisionModel(ABC):
     horizon: float = 0.2
 
     def __post_init__(self) -> None:
-        check_kind("robot", self.robot, Robot)
-        if self.stance is not None:
-            check_kind("stance", self.stance, Stance)
-        frame = self.robot.striker(self.striker).model_frame
-        if frame in self.held_by.constraint_frames(self.robot):
+        held = self.held_by.constraint_frames(self.robot)
+        if self.robot.striker(self.striker).model_frame in held:
             raise InputError(f"striker {self.striker!r}: it is held by the stance; strike with another")
         object.__setattr__(self, "normal", check_direction("normal", self.normal))
         check_positive("horizon [s]", self.horizon)
@@ -158,7 +155,7 @@ class CollisionModel(ABC):
     @property
     def held_by(self) -> Stance:
         """The stance, or the robot's default one."""
-        return usual_stance(self.robot) if self.stance is None else self.stance
+        return stance_of(self.robot, self.stance)
 
     @staticmethod
     def check_separation(result: Collision) -> None:

@@ -29,7 +29,7 @@ from impactopt.collision.interface import Collision
 from impactopt.collision.native import native_collision, native_gradient, native_jacobian
 from impactopt.collision.outputs import OF_SERVO, SCALARS, check_jacobian, check_outputs
 from impactopt.collision.stepped import SteppedModel
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, check_array, check_choice
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,14 +184,17 @@ class SymbolicModel(SteppedModel):
         Raises
         ------
         InputError : a model with "rk4" or with further freezes; the target's results, configuration or
-            velocity among the outputs.
+            velocity among the outputs; another name in `by`.
         """
         self._check_outputs(outputs, every)
         check_jacobian(outputs, self.stepping, self.n_freezes)
         whole = self._with_parameters(self._jacobian(tuple(outputs), every), parameters)
         inputs = [ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()]
         found = dict(zip(whole.name_out(), whole.call(inputs), strict=True))
-        others = tuple(f"_by_{name}" for name in ("q", "v", "feedforward") if name not in by)
+        possible = [name for name in ("q", "v", "feedforward") if name in whole.name_in()]
+        for name in by:
+            check_choice("no Jacobian by", name, possible)
+        others = tuple(f"_by_{name}" for name in possible if name not in by)
         kept = {name: x for name, x in found.items() if not others or not name.endswith(others)}
         return ca.Function(whole.name(), inputs, [*kept.values()], whole.name_in(), [*kept])
 

@@ -169,7 +169,8 @@ def numbers_of(instance: Any) -> dict[str, float]:
 
 
 def check_numbers(instance: Any) -> None:
-    """InputError unless all parameters of a law or a target are numbers in their ranges, or True or False.
+    """Makes floats of all parameters of a law or a target; InputError unless they are numbers in their
+    ranges, or True or False.
 
     They may not be too large, nor so small that quotients are. Fields without a description are numbers too.
     """
@@ -187,6 +188,7 @@ def check_numbers(instance: Any) -> None:
         if 0 < number < 1 / MOST and not description.allows(-1.0):
             zero = "0, or " if description.allows(0.0) else ""
             raise InputError(f"{name}: {number:g}; give {zero}a number of at least {1 / MOST:g}")
+        object.__setattr__(instance, field.name, number)
 
 
 def with_symbols(instance: Any) -> Any:

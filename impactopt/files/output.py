@@ -74,12 +74,16 @@ def record_of(
 
     Raises
     ------
-    InputError : a simulation or a replay that is no `Simulation`.
+    InputError : a simulation or a replay that is no `Simulation`, or is of another plan.
     """
-    for name, given in (("simulation", simulation), ("replay", replay)):
-        if given is not None:
-            check_kind(name, given, Simulation)
     plan, robot, result = solution.plan, solution.problem.robot, solution.result
+    for name, given in (("simulation", simulation), ("replay", replay)):
+        if given is None:
+            continue
+        check_kind(name, given, Simulation)
+        other = abs(given.expected - solution.trajectory.contact_start) > 0  # nan: unknown
+        if other or given.q.shape[1] != robot.model.nq:
+            raise InputError(f"{name} is of another plan: give this solution's, of validate()")
     arrays = _scene_arrays(solution.problem)
     parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}
     parts |= {"collision": solution.collision, "solver": result}

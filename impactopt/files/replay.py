@@ -7,6 +7,7 @@ import dataclasses
 import importlib.util
 import json
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -166,6 +167,10 @@ def load_planned(
     Raises
     ------
     InputError : there is no record, it holds no motion, or its joints are not those of the problem's robot.
+
+    Warns
+    -----
+    UserWarning : the record's own problem is another one today.
     """
     record = load_record(result)
     if not record.completed:
@@ -180,6 +185,12 @@ def load_planned(
         raise InputError(
             f"{result} was planned for other joints than those of the robot {robot.name!r} today; "
             "solve again, or give the file of its problem with --problem"
+        )
+    if not (given or settings or _may_be_of(record, problem)):
+        warnings.warn(
+            f"the problem of {result} is another one today than it was planned for, as after a change of its "
+            "robot's files: robot, target and limits are today's",
+            stacklevel=3,
         )
     missed = _trajectory(record, "missed") if "missed_time" in a else None
     return Planned(

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import MOST, InputError, check_direction, check_number
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.stance import Stance, usual_stance
+from impactopt.kinematics.stance import Stance, stance_of
 from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 
@@ -125,10 +125,9 @@ def striking_velocity(
     InputError : wrong shapes or NaN; no unit vector; an unknown striker; a stance the robot cannot take; a
         posture in which the striking point cannot move like that.
     """
+    frames = stance_of(robot, stance).constraint_frames(robot)
     q, n = robot.check_configuration(q), check_direction("normal", normal)
     speed = check_number("speed [m/s]", speed, most=MOST)
-    held_by = usual_stance(robot) if stance is None else stance
-    frames = held_by.constraint_frames(robot)
     body = ConstrainedDynamics.at(robot.model, q, frames, robot.striker(striker).model_frame)
     J = np.vstack([body.held, body.hand])
     required = np.concatenate([np.zeros(len(body.held)), speed * n])
@@ -157,13 +156,12 @@ def holding_torque(
     ------
     InputError : wrong shapes or NaN; a stance the robot cannot take.
     """
+    frames = stance_of(robot, stance).constraint_frames(robot)
     q = robot.check_configuration(q)
     v = np.zeros(robot.nv) if v is None else robot.check_velocity(v)
-    held_by = usual_stance(robot) if stance is None else stance
     bias = robot.nonlinear_effects(robot.model.createData(), q, v)
     if not np.all(np.isfinite(bias)):
         raise InputError("q, v: the forces of this motion are no finite numbers; give smaller ones")
-    frames = held_by.constraint_frames(robot)
     driven = np.append(np.zeros(robot.nv - robot.n, dtype=bool), ~robot.hinges)
     # Columns S' and J_c', or -H: driven joints' torques, and wrenches of fixed frames or accelerations.
     if frames:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, check_array, check_kind
 from impactopt.robots.robot import Robot, Sole, Striker
 
 USUAL_POSTURE = "half_sitting"  # name of the start posture where none is given
@@ -146,9 +146,18 @@ class Free(Stance):
         return ()
 
 
-def usual_stance(robot: Robot) -> Stance:
-    """Both soles of a robot with a free-flyer, else its fixed base."""
-    return BothSoles() if robot.floating else FixedBase()
+def stance_of(robot: Robot, stance: Stance | None) -> Stance:
+    """The stance; None: both soles of a robot with a free-flyer, else its fixed base.
+
+    Raises
+    ------
+    InputError : no robot, or no stance.
+    """
+    check_kind("robot", robot, Robot)
+    if stance is None:
+        return BothSoles() if robot.floating else FixedBase()
+    check_kind("stance", stance, Stance)
+    return stance
 
 
 def _check_floating(robot: Robot) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from impactopt.contact.targets import Nail
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, check_array, check_whole
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
@@ -89,6 +89,7 @@ def drive_nail(
         raise InputError(
             f"the nail is {nail.depth:g} m deep already; give a depth beyond that, not {depth:g} m"
         )
+    check_whole("most", most, least=1, most=10**6)
     blows: list[Blow] = []
     at, x = nail.depth, options.pop("start", "reach")
     from_plan = {name: value for name, value in options.items() if name != "starts"}  # a plan is one start

@@ -68,7 +68,7 @@ def moved_problem(
     new: dict[str, Any] = {}
     for name, vector in (("point", point), ("normal", normal)):
         if vector is not None:
-            new[name] = np.array(vector, dtype=float)
+            new[name] = check_array(f"moved: {name}", vector, (3,))
     if mass is not None:
         new["target"] = with_parameter(problem.target, "mass", mass)
     law = problem.law

@@ -5,11 +5,12 @@ sensitivities.
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, wraps
+from typing import Any, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -153,6 +154,20 @@ def _slightly_changed(problem: ImpactProblem) -> ImpactProblem:
 
 
 _known: WeakKeyDictionary[Solution, ParametricProgram] = WeakKeyDictionary()
+_alone = threading.RLock()
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _one_at_a_time(run: Callable[P, R]) -> Callable[P, R]:
+    """The function, for one thread at a time: all calls for a solution move one program."""
+
+    @wraps(run)
+    def locked(*args: P.args, **options: P.kwargs) -> R:
+        with _alone:
+            return run(*args, **options)
+
+    return locked
 
 
 def parametric_program(solution: Solution) -> ParametricProgram:
@@ -211,6 +226,7 @@ class Sensitivity:
         return f"<Sensitivity to {self.parameter}: {self.impulse:.4g} N s per unit>"
 
 
+@_one_at_a_time
 def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
     """Sensitivity of impulse and objective to a parameter, and the active constraints:
     `Solution.sensitivity`.
@@ -325,6 +341,7 @@ _FAR, _ITERATIONS_FIRST = 0.5, 150
 REPLANNING_TOLERANCES = {"kkt_tolerance": 1e-4, "complementarity_tolerance": 3e-5}
 
 
+@_one_at_a_time
 def moved_solution(
     solution: Solution,
     *,

@@ -355,6 +355,7 @@ def check_elements(problem: Any) -> None:
         raise InputError(
             f"contact_duration must be (shortest, longest) in seconds, not {problem.contact_duration}"
         )
+    object.__setattr__(problem, "contact_duration", (float(lo), float(hi)))
 
 
 def check_prices(problem: Any) -> None:

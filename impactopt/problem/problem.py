@@ -205,7 +205,9 @@ class ImpactProblem:
     def __post_init__(self) -> None:
         # `attempt` collects the error of a check and returns False. A check that needs parts which have
         # failed is skipped, so that the message has independent mistakes only.
-        check_kind("robot", self.robot, Robot)
+        kinds = {"robot": Robot, "stance": Stance, "swing": Phase, "follow": Phase}
+        for name, kind in kinds.items():
+            check_kind(name, getattr(self, name), kind)
         mistakes = Mistakes()
         mistakes.attempt(lambda: check_name("the problem", self.name, empty=True))
         striker = mistakes.attempt(lambda: self.robot.striker(self.striker))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -301,10 +301,17 @@ def place(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
     return q
 
 
-def check_count(kind: str, things: Sequence[Any]) -> None:
+def check_count(kind: str, things: Collection[Any]) -> None:
     """InputError if a robot has more than `MAX_ATTACHMENTS` of a kind."""
     if len(things) > MAX_ATTACHMENTS:
         raise InputError(f"the robot has {len(things)} {kind}s; give at most {MAX_ATTACHMENTS}")
+
+
+def check_parts(name: str, things: Any, kind: type) -> None:
+    """InputError unless an argument is a list of parts of a class, such as soles, and not of too many."""
+    if not isinstance(things, Collection) or not all(isinstance(thing, kind) for thing in things):
+        raise InputError(f"{name} must be a list of {kind.__name__}s, not {shortened(repr(things))}")
+    check_count(kind.__name__.lower(), things)
 
 
 def by_name(kind: str, things: Sequence[Any]) -> dict[str, Any]:

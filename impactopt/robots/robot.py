@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import Mistakes, check_array, raw_array
+from impactopt.errors import Mistakes, check_array, check_kind, raw_array
 from impactopt.robots import build, checks, tools
 from impactopt.robots import mjcf as _mjcf
 from impactopt.robots import urdf as _urdf
@@ -230,8 +230,8 @@ class Robot:
         gravity (3,) : [m/s2], world axes; default the model's.
         tendons : ranges of sums of joint angles.
         """
-        build.check_count("sole", soles)
-        build.check_count("striker", strikers)
+        build.check_parts("soles", soles, Sole)
+        build.check_parts("strikers", strikers, Striker)
         model = model.copy()
         tell_apart(model)
         checks.check_joint_types(model)
@@ -406,12 +406,14 @@ class Robot:
 
     def with_striker(self, striker: Striker) -> Robot:
         """A copy of the robot with `striker`, which replaces one of the same name."""
+        check_kind("striker", striker, Striker)
         model = self.model.copy()
         build.add_striker(model, striker)
         return dataclasses.replace(self, model=model, strikers={**self.strikers, striker.name: striker})
 
     def with_tool(self, tool: Tool) -> Robot:
         """A copy of the robot that holds `tool`: its mass on the link, and a striker of its name."""
+        check_kind("tool", tool, Tool)
         return dataclasses.replace(self, **tools.fields_with_tool(self, tool))
 
     def with_grip(self, name: str, grip: SoftGrip) -> Robot:

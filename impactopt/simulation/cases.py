@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from impactopt.collision import Collision, effective_mass
 from impactopt.errors import InputError, check_positive
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.stance import USUAL_POSTURE, Stance, usual_stance
+from impactopt.kinematics.stance import USUAL_POSTURE, Stance, stance_of
 from impactopt.kinematics.support import margin as margin_in
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.robot import Robot
@@ -48,11 +48,12 @@ def posture_of_effective_mass(
     InputError : a mass that is not positive; an unknown striker; a stance the robot cannot take; no such
         posture found (with the nearest mass).
     """
+    taken = stance_of(robot, stance)
     check_positive("mass [kg]", mass)
     if start is None and USUAL_POSTURE not in robot.postures:
         raise InputError(f"robot {robot.name!r} has no posture {USUAL_POSTURE}; give start=")
     q0 = robot.posture(USUAL_POSTURE) if start is None else robot.check_configuration(start, name="start")
-    search = _PostureSearch(robot, float(mass), striker, normal, stance, q0, inside)
+    search = _PostureSearch(robot, float(mass), striker, normal, taken, q0, inside)
     d, error = np.zeros(robot.nv), np.inf
     for _ in range(4):  # SLSQP may stop early by a bad estimate of the Hessian: restart it from there
         d = search.improve(d)
@@ -74,13 +75,12 @@ class _PostureSearch:
         mass: float,
         striker: str,
         normal: ArrayLike,
-        stance: Stance | None,
+        taken: Stance,
         q0: Array,
         inside: float,
     ) -> None:
         self.robot, self.model, self.q0, self.inside = robot, robot.model, q0, inside
         self.mass, self.data = mass, robot.model.createData()
-        taken = usual_stance(robot) if stance is None else stance
         self._effective_mass = effective_mass(robot, striker=striker, normal=normal, stance=taken)
         frames = taken.constraint_frames(robot)
         pin.framesForwardKinematics(self.model, self.data, q0)

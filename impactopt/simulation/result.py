@@ -126,7 +126,7 @@ class Scene:
         return np.flatnonzero(self.standing[stance]) if self.standing.size else np.arange(len(self.soles))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Simulation:
     """Result of a replay: histories over ``time`` (k,) [s], contact, and summary quantities.
 

@@ -318,7 +318,7 @@ def read_sweep_file(
     """
     path = sweep_file(path)
     try:
-        text = read_plain(path, LONGEST_TEXT).decode()
+        text = read_plain(path, LONGEST_TEXT).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise InputError(f"cannot read {shortened(str(path), 300)}: {reason}") from error

@@ -206,7 +206,7 @@ def sampled(start: float, end: float, step: float) -> Array:
     return np.linspace(start, end, max(2, round((end - start) / step) + 1))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
     """Reference trajectory of the servo, the only part of a plan that reaches a simulation.
 
@@ -311,7 +311,7 @@ def moved_in_contact(time: Array, motion: Array, since: Array) -> Array:
     return np.asarray(CubicHermiteSpline(time, y, rates)(since))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedCollision:
     """Predicted collision of a plan, at contact and at the m collocation points.
 
@@ -394,7 +394,7 @@ class PlannedScenario:
         return out | ({"zmp_margin_m": float(margin(polygon, zmp(hit.ground)).min())} if len(polygon) else {})
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Plan:
     """A planned impact motion.
 

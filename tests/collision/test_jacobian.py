@@ -219,6 +219,11 @@ def test_other_models_are_refused(options, output, why):
         implicit("arm", **options).jacobian_function((output,))
 
 
+def test_a_jacobian_by_what_is_no_input_is_refused():
+    with pytest.raises(InputError, match="no Jacobian by 'feedforward'; there are q, v"):
+        implicit("arm", VirtualMass, **SHORT).jacobian_function(("impulse",), by=("q", "feedforward"))
+
+
 @pytest.mark.slow
 def test_tangents_stay_within_the_bounds_of_their_arrays(tmp_path: Path) -> None:
     """Under the compiler's sanitizer of undefined behaviour, which ends the process."""

@@ -40,6 +40,9 @@ from impactopt import (
     SpringDamper,
     Target,
     effective_mass,
+    holding_torque,
+    posture_of_effective_mass,
+    striking_velocity,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
@@ -636,6 +639,22 @@ def test_bad_models_are_refused_before_anything_is_built(options, message):
     }
     with pytest.raises(InputError, match=message):
         SDC(**(scene | options))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda robot, **stance: effective_mass(robot, striker="right_hand", normal=X, **stance),
+        lambda robot, **stance: holding_torque(robot, np.zeros(35), **stance),
+        lambda robot, **stance: striking_velocity(robot, np.zeros(35), "right_hand", X, 1.0, **stance),
+        lambda robot, **stance: posture_of_effective_mass(robot, 5.0, "right_hand", X, **stance),
+    ],
+)
+def test_states_to_start_from_refuse_what_is_no_robot_or_stance(function):
+    with pytest.raises(InputError, match="robot must be a Robot, not 'talos'"):
+        function("talos")
+    with pytest.raises(InputError, match="stance must be a Stance, not 'both'"):
+        function(robot_named("talos"), stance="both")
 
 
 def test_a_batch_refuses_the_configurations_that_a_collision_refuses():

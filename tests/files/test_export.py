@@ -57,6 +57,7 @@ from impactopt.files.export import FORMATS, export_planned
 from impactopt.files.export import mujoco_scene as formulas
 from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
+from impactopt.files.record import Record
 from impactopt.files.replay import Planned
 from impactopt.simulation import Simulation, scene_of, simulate_mujoco
 from impactopt.simulation.mujoco_world import MujocoOptions, build_world
@@ -78,6 +79,19 @@ def arm() -> Solution:
 @pytest.fixture(scope="module")
 def planned(arm: Solution) -> Planned:
     return Planned(record=record_of(arm), problem=arm.problem, reference=arm.trajectory)
+
+
+@pytest.fixture(scope="module")
+def filed(planned: Planned) -> Record:
+    """The plan's record as if its problem were that of a file."""
+    path = problem_file("arm_planar")
+    own = {**planned.record.summary["problem"], "hash": load_problem(path).hash}
+    return dataclasses.replace(
+        planned.record,
+        problem=path.read_text(encoding="utf-8"),
+        problem_path=path,
+        summary={**planned.record.summary, "problem": own},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -260,6 +274,8 @@ def test_effort_without_gravity_is_for_arms_that_hold_themselves(
         q = np.array([column[k] for column in where])
         held = pin.computeGeneralizedGravity(robot.model, data, q)
         np.testing.assert_allclose([column[k] for column in less], held, atol=2e-3 * np.abs(held).max())
+    with pytest.raises(InputError, match="gravity must be a bool, not 'no'"):
+        arm.export("csv", tmp_path / "text", gravity="no")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="depend on the contact forces"):
         still.export("csv", tmp_path / "legs", gravity=False)
     with pytest.raises(InputError, match="needs the whole effort"):
@@ -307,6 +323,8 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
         )
     with pytest.raises(InputError, match="above 0"):
         arm.export("csv", tmp_path / "none", smooth=(0.0, 1.0))
+    with pytest.raises(InputError, match=r"smooth: acceleration and jerk: expected shape \(2\)"):
+        arm.export("csv", tmp_path / "none", smooth=60.0)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -359,11 +377,12 @@ def test_a_smoothed_motion_may_be_for_a_target_that_does_not_break(tmp_path: Pat
     assert json.loads(done.stdout)["caution"].endswith("in the files are of it, the motion is the plan's")
 
 
-def test_feed_forward_beyond_the_torque_limit_is_told(planned: Planned, tmp_path: Path) -> None:
+def test_feed_forward_beyond_the_torque_limit_is_told(
+    filed: Record, planned: Planned, tmp_path: Path
+) -> None:
     """A smoothed motion that is near the plan's jumps accelerates beyond what its motors can."""
-    path, out, robot = problem_file("arm_planar"), tmp_path / "csv", planned.problem.robot
-    text = path.read_text(encoding="utf-8")
-    save_record(dataclasses.replace(planned.record, problem=text, problem_path=path), tmp_path / "arm")
+    out, robot = tmp_path / "csv", planned.problem.robot
+    save_record(filed, tmp_path / "arm")
     given = ["export", str(tmp_path / "arm"), "--to", "csv", "--out", str(out), "--smooth", "200,50000"]
     done = runner.invoke(app, [*given, "--no-gravity"])
     assert "caution: its feed-forward" in done.stdout
@@ -798,11 +817,9 @@ def test_a_missing_package_says_how_to_get_it(
 
 # ---------------------------------------------------------------- the command
 def test_the_command_writes_and_lists_files(
-    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    filed: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = problem_file("arm_planar")
-    text = path.read_text(encoding="utf-8")
-    save_record(dataclasses.replace(planned.record, problem=text, problem_path=path), tmp_path / "arm")
+    save_record(filed, tmp_path / "arm")
     done = runner.invoke(app, ["export", str(tmp_path / "arm"), "--to", "csv", "--rate", "100", "--json"])
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)
@@ -821,18 +838,15 @@ def test_the_command_writes_and_lists_files(
 
 
 @pytest.fixture
-def own_and_other(planned: Planned, tmp_path: Path) -> tuple[Path, list[tuple[Path, bool]]]:
+def own_and_other(filed: Record, tmp_path: Path) -> tuple[Path, list[tuple[Path, bool]]]:
     """A saved plan; its problem's file and another one, and whether that is told."""
-    path = problem_file("arm_planar")
-    text = path.read_text(encoding="utf-8")
-    own = {**planned.record.summary["problem"], "hash": load_problem(path).hash}
-    record = dataclasses.replace(
-        planned.record, problem=text, summary={**planned.record.summary, "problem": own}
+    save_record(filed, tmp_path / "arm")
+    other, changed = (
+        tmp_path / "other.toml",
+        filed.problem.replace("resistance_N = 600", "resistance_N = 500"),
     )
-    save_record(record, tmp_path / "arm")
-    other = tmp_path / "other.toml"
-    other.write_text(text.replace("resistance_N = 600.0", "resistance_N = 500.0"), encoding="utf-8")
-    return tmp_path / "arm", [(path, False), (other, True)]
+    other.write_text(changed, encoding="utf-8")
+    return tmp_path / "arm", [(problem_file("arm_planar"), False), (other, True)]
 
 
 def test_a_problem_file_that_is_not_the_plans_is_told(

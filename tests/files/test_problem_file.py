@@ -89,6 +89,12 @@ def test_the_demos_file_is_the_punch_it_says() -> None:
     assert read_problem_file(PUNCH).solver.name == "ipm"
 
 
+def test_a_byte_order_mark_of_windows_is_no_mistake(tmp_path: Path) -> None:
+    file = tmp_path / "windows.toml"
+    file.write_text(PUNCH.read_text("utf-8").replace("\n", "\r\n"), "utf-8-sig", newline="")
+    assert load_problem(file).hash == load_problem(PUNCH).hash
+
+
 def test_the_commented_keys_of_the_demos_file_show_the_defaults(tmp_path: Path) -> None:
     """Whoever takes the # away gets the same problem, and can then change the number."""
     text = PUNCH.read_text(encoding="utf-8")

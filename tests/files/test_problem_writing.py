@@ -406,6 +406,11 @@ def _point(robot: Robot, posture: str, striker: str) -> Any:
     return data.oMf[robot.model.getFrameId(robot.striker(striker).model_frame)].translation.copy()
 
 
+def test_what_is_no_problem_cannot_be_written() -> None:
+    with pytest.raises(InputError, match="problem must be an ImpactProblem, not 'arm_planar'"):
+        write_problem("arm_planar")  # type: ignore[arg-type]
+
+
 def test_solver_settings_are_written(nailing: ImpactProblem) -> None:
     solver = SolverSettings(
         name="ipopt", time_limit=3.5, options={"ipopt": {"tol": 1e-5}, "sqp": {"radius": 2.0}}

@@ -159,6 +159,16 @@ def test_a_plan_of_another_robot_is_refused(saved: Path, tmp_path: Path) -> None
         load_planned(other)
 
 
+def test_a_problem_that_has_changed_since_its_plan_is_told(saved: Path, tmp_path: Path) -> None:
+    """As by another URDF under the same name: a replay's error would be taken for the plan's."""
+    text = PUNCH.read_text("utf-8").replace("mass_kg = 5.0", "mass_kg = 5.5")
+    heavier = resaved(saved, tmp_path / "heavier", problem=text)
+    with pytest.warns(
+        UserWarning, match="heavier is another one today .* after a change of its robot's files"
+    ):
+        assert not load_planned(heavier).of_other_problem
+
+
 def test_a_result_without_a_motion_has_nothing_to_replay(tmp_path: Path) -> None:
     save_record(Record(summary={"note": "stopped early"}), tmp_path)
     with pytest.raises(InputError, match="no motion to replay: stopped early"):

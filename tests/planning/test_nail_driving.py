@@ -166,6 +166,8 @@ def test_what_cannot_be_driven_is_refused(solver: Solver) -> None:
         drive_nail(nailing(), depth=0.01)
     with pytest.raises(InputError, match="depth"):
         drive_nail(nailing(), depth=float("nan"))
+    with pytest.raises(InputError, match="most: 0; give a whole number"):
+        drive_nail(nailing(), depth=0.05, most=0)
     assert not solver.asked
 
 

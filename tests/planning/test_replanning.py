@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import threading
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -136,6 +137,22 @@ def test_where_one_start_leads_nowhere_the_next_does(
     assert bent.impulse == pytest.approx(arm.moved(mass=mass, options=TIGHT).impulse, rel=1e-5)
 
 
+def test_threads_that_move_one_plan_at_once_get_the_plans_that_they_ask_for(arm: Solution) -> None:
+    """All changes of a plan share one program, so a second change must not reach into an unfinished one."""
+    light, heavy = (factor * arm.problem.target.parameters["mass"] for factor in (0.98, 1.04))
+    others: list[float] = []
+    second = threading.Thread(target=lambda: others.append(arm.moved(mass=heavy).impulse))
+
+    def meanwhile(_: Any) -> None:
+        if second.ident is None:
+            second.start()
+            second.join(timeout=0.5)  # it has to wait for this change, which therefore must not wait for it
+
+    first = arm.moved(mass=light, callback=meanwhile).impulse
+    second.join()
+    assert [first, *others] == [arm.moved(mass=mass).impulse for mass in (light, heavy)]
+
+
 def test_a_program_with_other_numbers_is_that_of_its_problem(arm: Solution) -> None:
     """What takes the numbers of another program has its functions."""
     bent = parametric_program(arm)
@@ -217,6 +234,8 @@ def test_a_program_that_does_not_follow_is_built_anew(arm: Solution) -> None:
 def test_what_cannot_be_bent_is_said(arm: Solution) -> None:
     with pytest.raises(InputError, match=r"moved: a plan has no parameter 'masss' \(did you mean 'mass'\?\)"):
         arm.moved(masss=0.06)
+    with pytest.raises(InputError, match="moved: point: expected numbers, got 'here'"):
+        arm.moved(point="here")
     with pytest.raises(InputError, match="nothing is moved"):
         arm.moved()
     with pytest.raises(InputError, match=r"target\.mas.*target\.mass"):

@@ -243,9 +243,26 @@ def test_bad_input_is_named(robot: Robot, changes: dict[str, Any], says: str) ->
         problem(robot, **changes)
 
 
-def test_a_robot_by_its_name_is_none(robot: Robot) -> None:
-    with pytest.raises(InputError, match="robot must be a Robot, not 'standin'"):
-        dataclasses.replace(problem(robot), robot="standin")  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("name", "given", "says"),
+    [
+        ("robot", "standin", "robot must be a Robot, not 'standin'"),
+        ("stance", "both", "stance must be a Stance, not 'both'"),
+        ("swing", (0.4, 0.8), r"swing must be a Phase, not \(0.4, 0.8\)"),
+        ("follow", None, "follow must be a Phase, not None"),
+    ],
+)
+def test_parts_of_another_type_are_refused(robot: Robot, name: str, given: Any, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        dataclasses.replace(problem(robot), **{name: given})
+
+
+def test_a_problem_does_not_follow_what_it_was_made_from(robot: Robot) -> None:
+    duration, mass = np.array([0.0, 0.1]), np.array(5.0)
+    made = problem(robot, contact_duration=duration, target=FreeMass(mass=mass))
+    duration[1], mass[()] = 0.05, -1.0
+    assert made.contact_duration == (0.0, 0.1)
+    assert made.target == FreeMass(mass=5.0) and hash(made.target) == hash(FreeMass(mass=5.0))
 
 
 def test_a_start_with_a_bad_configuration_is_named(robot: Robot) -> None:

@@ -342,6 +342,18 @@ def test_robot_goes_to_other_processes(talos_robot: Robot) -> None:
 # ---- bad input
 
 
+def test_parts_of_another_type_are_refused() -> None:
+    robot = load_robot("arm7")
+    with pytest.raises(InputError, match=r"strikers must be a list of Strikers, not .*'fist'"):
+        Robot.from_model(robot.model, strikers=robot.strikers)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="soles must be a list of Soles, not 'left'"):
+        Robot.from_model(robot.model, soles="left")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="striker must be a Striker, not 'fist'"):
+        robot.with_striker("fist")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="tool must be a Tool, not 'hammer'"):
+        robot.with_tool("hammer")  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("mass", "moments", "message"),
     [

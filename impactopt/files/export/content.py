@@ -22,7 +22,7 @@ from impactopt import __version__
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.errors import InputError, check_choice, check_number
+from impactopt.errors import InputError, check_array, check_choice, check_kind, check_number
 from impactopt.files.export.motion import JUMP, Motion, motion_at, with_passive_at_rest
 from impactopt.files.export.smooth import Smoothness, smoothed
 from impactopt.files.record import plain, read_json
@@ -255,6 +255,7 @@ def export_of(
         a robot that is not bolted, without gravity or smoothed; limits that no motion satisfies, or none that
         hits.
     """
+    check_kind("gravity", gravity, bool)
     robot = planned.problem.robot
     order = check_export(planned.record.summary.get("status"), robot, rate, joints)
     smoothing: dict[str, float] | None = None
@@ -293,7 +294,8 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
     InputError : no motion satisfies the limits; it does not hit the target, or presses more than it hits; it
         does not break a board that the plan breaks.
     """
-    within = Smoothness(acceleration=limits[0], jerk=limits[1])
+    acceleration, jerk = check_array("smooth: acceleration and jerk", limits, (2,))
+    within = Smoothness(acceleration=acceleration, jerk=jerk)
     reference = smoothed(planned.reference, planned.problem, within)
     replayed = simulate(planned.problem, reference)
     if not replayed.impulse:

@@ -14,7 +14,7 @@ from impactopt.bodies.world import TargetBody
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_kind
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import (
     ELEMENTS,
@@ -254,6 +254,7 @@ def write_problem(
 
 def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = ".") -> dict[str, Any]:
     """Data of a problem's file, without defaults; see `write_problem`."""
+    check_kind("problem", problem, ImpactProblem)
     factories: dict[str, Any] = {f.name: f.default_factory for f in fields(ImpactProblem)}
     robot, built = robot_data(problem.robot, Path(folder))
     if problem.gains:

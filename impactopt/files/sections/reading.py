@@ -251,7 +251,7 @@ def _robot_given_once(data: Mapping[str, Any]) -> list[Mistake]:
 
 def _read(path: Path) -> str:
     try:
-        return read_plain(path, LONGEST_TEXT).decode()
+        return read_plain(path, LONGEST_TEXT).decode("utf-8-sig")
     except FileNotFoundError as error:
         folder = path.parent
         near = (

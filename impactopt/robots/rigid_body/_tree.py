@@ -20,7 +20,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, check_array, did_you_mean, shortened
 from impactopt.robots.checks import check_configuration
 from impactopt.robots.couplings import axis_of
 from impactopt.robots.model import JointAngles
@@ -107,6 +107,8 @@ class Tree:
     """
 
     def __init__(self, model: Any) -> None:
+        if not isinstance(model, pin.Model):
+            raise InputError(f"model must be a pin.Model, as that of a robot, not {shortened(repr(model))}")
         self.model = model
         self.nq, self.nv = int(model.nq), int(model.nv)
         self.gravity: Vector = [float(x) for x in model.gravity.linear]

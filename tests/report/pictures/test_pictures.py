@@ -53,8 +53,11 @@ def solution_of(planned: Planned) -> Solution:
 @pytest.fixture(scope="module")
 def punch_record(biped_plan: Planned) -> Record:
     """A biped's plan, solved and simulated; its replay on free soles is made up."""
+    solution = solution_of(biped_plan)
     made = still_solution(problem=still_problem()).validate(engine="mujoco")
-    return record_of(solution_of(biped_plan), simulation=biped_plan.simulation, replay=made)
+    q = np.tile(solution.trajectory.q[0], (len(made.time), 1))
+    made = dataclasses.replace(made, q=q, expected=np.nan)
+    return record_of(solution, simulation=biped_plan.simulation, replay=made)
 
 
 @pytest.fixture(scope="module")
@@ -406,6 +409,16 @@ def test_axes_without_a_grid_are_refused(biped_plan: Planned) -> None:
     free = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     with pytest.raises(InputError, match="no part of a grid"):
         solution_of(biped_plan).plot("motion", ax=free)
+
+
+def test_simulations_of_another_plan_are_refused(arm_plan: Planned, hammered: Solution) -> None:
+    """Their impulse and picture would be taken for those of this plan."""
+    solution, own = solution_of(arm_plan), arm_plan.simulation
+    later = dataclasses.replace(own, expected=solution.trajectory.contact_start + 0.1)
+    for other in (later, dataclasses.replace(own, q=np.zeros((len(own.time), 9)))):
+        with pytest.raises(InputError, match="simulation is of another plan: give this solution's"):
+            solution.plot("force", simulation=other)
+    assert hammered.plot("force", simulation=hammered.validate())
 
 
 @pytest.mark.parametrize("name", ["ax", "simulation", "replay"])

@@ -376,6 +376,8 @@ def test_bad_arguments_are_named() -> None:
     rb = symbols("g1").rb
     with pytest.raises(InputError, match=r"frame 'right_wrist_yaw_lnk'.*did you mean 'right_wrist_yaw_link'"):
         rb.frame("right_wrist_yaw_lnk")
+    with pytest.raises(InputError, match=r"model must be a pin\.Model, as that of a robot, not 'talos'"):
+        RigidBody("talos")
     with pytest.raises(InputError, match="did you mean 'quaternion'"):
         RigidBody(rb.model, base="quaternions")
     with pytest.raises(InputError, match="v: expected a column of 35 numbers"):

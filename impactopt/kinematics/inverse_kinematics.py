@@ -117,7 +117,8 @@ def inverse_kinematics(
 
     Raises
     ------
-    InputError : no posture found; the message has the smallest error, and the striking point of the guess.
+    InputError : no posture found; the message has the smallest error, and the striking points of that posture
+        and of the guess.
     """
     robot, model = coordinates.robot, coordinates.model
     data = model.createData()
@@ -135,7 +136,7 @@ def inverse_kinematics(
     # mass over the feet.
     ease = np.ones(model.nv)
     ease[:base] = 0.02
-    best_gap = np.inf
+    best_gap, nearest = np.inf, np.zeros(3)  # striking point of the best posture
     for k in range(starts):
         q = guess.copy()
         # off the guess: an arm in its plane of symmetry would stay there, whatever the orientation
@@ -158,7 +159,9 @@ def inverse_kinematics(
                 hand = np.reshape(hand, (6, model.nv))  # Pinocchio drops an axis if nv is 1
                 jacs.append(hand[:3])
             off = float(np.abs(np.concatenate(errors)).max())
-            best_gap = min(best_gap, max(float(np.linalg.norm(error)) for error in errors))
+            gap = max(float(np.linalg.norm(error)) for error in errors)
+            if gap < best_gap:
+                best_gap, nearest = gap, np.array(data.oMf[hands[0][0]].translation)
             orienting = facing is not None and iteration < FACING_STEPS
             if off < tolerance and (not orienting or np.abs(step).max() < FACING_STEP):
                 return q
@@ -199,8 +202,9 @@ def inverse_kinematics(
     others = "".join(f" and {np.round(other, 4).tolist()} m" for _, other in hands[1:])
     raise InputError(
         f"the point {np.round(point, 4).tolist()} m{others} is out of reach of {names}{fixed}: "
-        f"the nearest posture found is off by {best_gap:.3g} m (the striking point starts at "
-        f"{np.round(start, 3).tolist()} m); move the point nearer"
+        f"the nearest posture found is off by {best_gap:.3g} m, with the striking point at "
+        f"{np.round(nearest, 3).tolist()} m (it starts at {np.round(start, 3).tolist()} m); move the point "
+        "nearer to that"
     ) from None
 
 

@@ -100,8 +100,10 @@ class ContactReplay:
     @property
     def off(self) -> float:
         """Difference of the impulses [%] beyond the reported model error."""
-        # The model error is reported by itself, and must not refuse a plan a second time.
-        return abs(self.impulse_pct - self.known)
+        # The model error is reported by itself, and must not refuse a plan a second time; nor must it refuse
+        # one that is more accurate than its model.
+        least, most = sorted((0.0, self.known))
+        return max(least - self.impulse_pct, self.impulse_pct - most, 0.0)
 
     def __str__(self) -> str:
         """Message: how the replayed contact differs from the planned one."""
@@ -202,7 +204,7 @@ def checked(result: SolverResult, replay: ContactReplay | None) -> SolverResult:
     """The result itself if its replay agrees; else acceptable or failed, by the impulses' difference."""
     if replay is None or not result.status.usable or replay.off <= SOLVED_WITHIN:
         return result
-    off, message = replay.off, f"The planned contact is off by {replay.off:.2g} %: {replay}."
+    off, message = replay.off, f"The planned contact is off by {abs(replay.impulse_pct):.2g} %: {replay}."
     if off <= ACCEPTABLE_WITHIN:
         return replace(result, status=Status.ACCEPTABLE, message=message)
     # Counted as a violation, so that results of other guesses rank before it (`rank_of`), and

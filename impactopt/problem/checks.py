@@ -107,7 +107,8 @@ def check_stance(problem: Any) -> None:
     if stance.sole_frames(robot) and not (gravity[2] < 0 and not gravity[:2].any()):
         raise InputError(
             f"gravity is {gravity.tolist()} m/s2, and soles that stand need one along -z: turn it, as "
-            "<option gravity> of an MJCF, or bolt the robot to the ground (floating = false)"
+            "[robot] gravity_m_s2 or <option gravity> of an MJCF, or bolt the robot to the ground "
+            "(floating = false)"
         )
     if np.any(stance.compliance > 0):
         raise InputError(

@@ -28,6 +28,7 @@ from impactopt.problem.terms import (
     TorqueLimit,
 )
 from impactopt.problem.terms.first_touch import face_of
+from impactopt.robots.loads import weight_of
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
@@ -50,11 +51,26 @@ BLOCKED_DEPTH = 0.01  # [m] of penetration in all postures at the hit point, abo
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """Reasons why no solve can succeed: implausibly large soles; else a start beyond the target, and a hit
-    point that no balanced posture reaches.
+    """Reasons why no solve can succeed: implausibly large soles; else a start beyond the target, a hit point
+    that no balanced posture reaches, and soles that must bear more than the robot's weight.
     """
-    found = list(giant_soles(problem.robot)) or [_beyond(problem), _out_of_balance(problem)]
+    found = list(giant_soles(problem.robot))
+    found = found or [_beyond(problem), _out_of_balance(problem), _too_light(problem)]
     return [text for text in found if text]
+
+
+def _too_light(problem: ImpactProblem) -> str:
+    """Message if the least forces of the soles that stand at first exceed the weight, which is all that they
+    bear at rest; else "".
+    """
+    soles, least = len(problem.stance_coordinates[0].legs), problem.term(ContactWrenchCone).minimum_force
+    weight = weight_of(problem.robot)
+    if problem.stance.held_hands(problem.robot) or soles * least <= weight:  # hands may pull it down
+        return ""
+    return (
+        f"the robot is too light: [terms.contact_wrench_cone] minimum_force_N asks {least:g} N of each of "
+        f"{counted(soles, 'sole')}, and it weighs {weight:.3g} N; give less than {weight / soles:.2g} N"
+    )
 
 
 def _beyond(problem: ImpactProblem) -> str:

@@ -36,10 +36,9 @@ def with_joint(
     index = one.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), name, *bounds)
     one.appendBodyToJoint(index, body, back)
     one.addFrame(pin.Frame(mark, index, 0, back, pin.FrameType.BODY))
-    one.gravity = model.gravity
     whole = pin.appendModel(model, one, check_frame(model, frame, name), placement)
-    whole.name = model.name
-    # appendModel leaves armatures out
+    # appendModel leaves out gravity and armatures
+    whole.name, whole.gravity = model.name, model.gravity
     for old_name, old in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
         at = whole.joints[whole.getJointId(old_name)].idx_v
         whole.armature[at : at + old.nv] = model.armature[old.idx_v : old.idx_v + old.nv]

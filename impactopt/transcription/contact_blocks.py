@@ -368,8 +368,10 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     balance = _inertia(c)(q, change) + j * impulse - c.sole_wrench_map(y, legs, w)
     lost = -ca.dot(j, change)  # speed of the hand that the impulse takes: I / m_a
     approach = ca.dot(j, c.velocity(y, legs, u0)) - before
-    # zeta = d / (2 sqrt(k mu)), with 1/mu = 1/m_a + 1/m_t
-    damping_ratio = damping / 2 * ca.sqrt((lost / impulse + inverse_mass) / stiffness)
+    # zeta = d / (2 sqrt(k mu)), with 1/mu = 1/m_a + 1/m_t. Where an iterate's du speeds the hand up, 1/m_a is
+    # below zero, and its root would be nan: of a given restitution, too, as 0 nan is nan.
+    inverse_reduced_mass = ca.fmax(lost / impulse + inverse_mass, 1e-9)
+    damping_ratio = damping / 2 * ca.sqrt(inverse_reduced_mass / stiffness)
     e = rigid * given + (1 - rigid) * two_mass_restitution(damping_ratio)
     out = {
         # over what the limits' forces give in 0.1 s, so that impulses are of order one

@@ -535,6 +535,14 @@ def test_out_of_reach_says_how_far_off() -> None:
         inverse_kinematics(case.c, "hand", np.array([2.0, 0.0, 0.5]), case.posture)
 
 
+def test_out_of_reach_names_the_point_that_is_reached() -> None:
+    """Beside a planar arm's plane that is its foot there: no smaller distance ahead would do."""
+    robot = load_robot("planar_arm")
+    c, posture = StanceCoordinates(robot, (), robot.posture("ready")), robot.posture("ready")
+    with pytest.raises(InputError, match=r"off by 0.05 m, with the striking point at \[0.7, 0.0, 0.75\] m"):
+        inverse_kinematics(c, "hammer", np.array([0.7, 0.05, 0.75]), posture)
+
+
 def test_out_of_reach_is_a_distance_and_not_its_largest_component() -> None:
     robot = load_robot("planar_arm")  # its shoulder is at 0.6 m
     c, posture = StanceCoordinates(robot, (), robot.posture("ready")), robot.posture("ready")

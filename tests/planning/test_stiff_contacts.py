@@ -231,6 +231,29 @@ def test_a_plan_whose_board_breaks_earlier_is_none(broken: Solution) -> None:
     assert result.max_violation > VIOLATED
 
 
+@pytest.mark.parametrize(
+    ("too_large", "known", "status"),
+    [
+        (0.28, 28.0, Status.SOLVED),  # as its model's error says
+        (0.02, 28.0, Status.SOLVED),  # more accurate than its model: it was refused for 26 %
+        (-0.03, 28.0, Status.ACCEPTABLE),
+        (-0.03, -2.5, Status.SOLVED),
+        (0.34, 28.0, Status.FAILED),
+        (0.0, 0.0, Status.SOLVED),
+        (-0.03, 0.0, Status.ACCEPTABLE),
+    ],
+)
+def test_a_plan_is_not_refused_for_being_more_accurate_than_its_model(
+    broken: Solution, too_large: float, known: float, status: Status
+) -> None:
+    assert broken.contact_replay is not None
+    replay = dataclasses.replace(broken.contact_replay, planned=1.0 + too_large, impulse=1.0, known=known)
+    result = checked(broken.result, replay)
+    assert result.status is status
+    if status is not Status.SOLVED:
+        assert f"is off by {100 * abs(too_large):.2g} %" in result.message
+
+
 def test_forces_that_are_asked_for_never_pull() -> None:
     """An objective on the largest force makes no use of a contact that holds."""
     problem = with_stiffness("arm_planar", 1e7)

@@ -17,6 +17,7 @@ from support.small_robots import arm, biped
 from typer.testing import CliRunner
 
 from impactopt import (
+    ContactWrenchCone,
     FixedBase,
     FreeMass,
     ImpactProblem,
@@ -73,6 +74,17 @@ def test_a_point_that_only_a_fall_reaches_is_out_of_balance() -> None:
     centre = pin.centerOfMass(far.robot.model, far.robot.model.createData(), far.contact_posture)
     polygon = support_polygon(far.robot, far.coordinates)
     assert margin(polygon, np.array(centre)[None, :2])[0] < 0.0
+
+
+def test_soles_that_must_bear_more_than_the_weight_are_told() -> None:
+    """At rest they bear the weight: of a light robot, or of one on the moon, less than the default asks."""
+    problem = _punch([0.45, -0.2, 1.0])
+    weight = 9.81 * pin.computeTotalMass(problem.robot.model)
+    for least, told in ((0.49 * weight, 0), (0.51 * weight, 1)):
+        cone = ContactWrenchCone(minimum_force=least)
+        found = hopeless(dataclasses.replace(problem, terms=(cone,)))
+        assert len(found) == told
+        assert all(f"minimum_force_N asks {least:g} N of each of 2 soles" in text for text in found)
 
 
 def test_a_start_beyond_the_target_is_told_with_its_distance() -> None:

@@ -64,7 +64,8 @@ def test_the_page_of_soft_grips_gives_the_natural_frequency_of_its_hammer() -> N
 @pytest.mark.parametrize("frame", ["wrist", "elbow"])
 def test_a_grip_at_rest_makes_the_robot_with_the_firm_tool(frame: str) -> None:
     """Of a tool at the end, and of one in the middle, whose joint is not the last."""
-    firm = planar_arm().with_tool(Tool.hammer(frame=frame, name="second", face=[0.0, 1.0, 0.0]))
+    arm = planar_arm(gravity=[2.0, 1.0, -3.0])
+    firm = arm.with_tool(Tool.hammer(frame=frame, name="second", face=[0.0, 1.0, 0.0]))
     axis = np.array([0.6, 0.0, 0.8])
     soft = firm.with_grip("second", grip(axis=axis))
     q = pin.randomConfiguration(firm.model, firm.lower, firm.upper)
@@ -76,15 +77,17 @@ def test_a_grip_at_rest_makes_the_robot_with_the_firm_tool(frame: str) -> None:
     np.testing.assert_allclose(H[np.ix_(others, others)], expected, atol=1e-12)
     # about its own axis: the tool's, by the parallel axis theorem; a spring has no rotor
     tool = firm.tools[-1]
-    arm = tool.center - np.array([0.0, 0.0, 0.08])
-    about = axis @ tool.inertia @ axis + tool.mass * (arm @ arm - (axis @ arm) ** 2)
+    lever = tool.center - np.array([0.0, 0.0, 0.08])
+    about = axis @ tool.inertia @ axis + tool.mass * (lever @ lever - (axis @ lever) ** 2)
     assert H[own, own] == pytest.approx(about)
-    places = []
+    places, weights = [], []
     for robot, at in ((firm, q), (soft, q_soft)):
         data = robot.model.createData()
         pin.framesForwardKinematics(robot.model, data, at)
         places.append(np.array(data.oMf[robot.model.getFrameId("striker:second")].homogeneous))
+        weights.append(np.array(pin.computeGeneralizedGravity(robot.model, data, at)))
     np.testing.assert_allclose(*places, atol=1e-12)
+    np.testing.assert_allclose(weights[1][others], weights[0], atol=1e-12)
 
 
 def test_other_joints_keep_their_numbers() -> None:

@@ -177,6 +177,29 @@ def test_the_block_is_the_impulse_balance(request: pytest.FixtureRequest, who: s
         assert wrong[:-1].max() > 1e-5 and wrong[-1] > 1e-4
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_block_is_finite_where_an_iterate_speeds_the_hand_up(
+    arm_transcription: Transcription, kind: str
+) -> None:
+    """On a wall the law's root was of a number below zero: nan, with a given restitution, too."""
+    t, rng = arm_transcription, np.random.default_rng(6)
+    problem, c = t.problem, t.coordinates
+    expression, given = impact(c, problem.striker), 0.6
+    slopes = ca.jacobian(expression.out, expression.z)
+    block = ca.Function("impact", [expression.z, expression.p], [expression.out, slopes])
+    law, wall = [LAW.stiffness, LAW.damping], 0.0
+    p = [*problem.normal, float(kind == "rigid"), given, *law, wall, 0.0]
+    p += [*problem.robot.torque_limit, *t.builder.limits.units]
+    u0 = rng.standard_normal(c.ny)
+    q = c.complete_motion(t.y0, u0, np.zeros(c.ny), t.legs0)[0]
+    row = jacobians(problem, q)[1]
+    du = row / (row @ row)  # the hand gets faster by 1 m/s
+    out, derivatives = map(np.asarray, block(np.concatenate([t.y0, u0, du, [2.0]]), p))
+    assert np.isfinite(out).all() and np.isfinite(derivatives).all()
+    if kind == "rigid":
+        assert out[-1, 0] == pytest.approx(-1.0 - (1 + given) * (row @ u0))
+
+
 def in_soles_axes(problem: ImpactProblem, q: Array, wrench: Array) -> Array:
     """Wrenches at the soles' origins (6 a sole) from the world's axes to each sole's."""
     model = problem.robot.model

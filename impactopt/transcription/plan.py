@@ -682,10 +682,10 @@ class Plan:
     def through_contact(self, s: Array, *, missed: bool = False) -> Array:
         """Independent coordinates (k, ny) at fractions s (k,) of the contact.
 
-        missed : they are those of the reference, which coasts.
+        missed : those of the reference, which coasts.
         """
         t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
-        if missed or t1 <= t0:
+        if missed or not len(self.collision.motion):
             return self.independent(1, t0 + (t1 - t0) * s, missed=missed)[0]
         return moved_in_contact(self.collision.time, self.collision.motion, (t1 - t0) * s)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from support.small_motions import blow_motion, given_until, reference, scene, standing, strike
 from support.small_robots import arm, biped, slider
 
-from impactopt import InputError, Robot, load_robot
+from impactopt import InputError, Robot, load_problem, load_robot, solve
 from impactopt.kinematics.support import margin
 from impactopt.simulation import Scene, Simulation, simulate_pinocchio
 
@@ -277,3 +277,15 @@ def test_a_diverging_simulation_says_when_and_what_to_do() -> None:
         settle=0.0,
     )
     assert sim.hand_speed[-1] == pytest.approx(0.1, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_plan_knows_the_motion_in_contact() -> None:
+    """Full dynamics move the joints as planned between the states before and after contact, too."""
+    solution = solve(load_problem("arm7"))
+    plan, replayed = solution.plan, solution.validate()
+    span = plan.contact_end - plan.contact_start
+    s = (replayed.time - plan.contact_start) / span
+    within = (s >= 0.0) & (s <= 1.0)
+    planned = plan.closed(plan.through_contact(s[within]))
+    assert np.abs(replayed.q[within] - planned).max() < 1e-4

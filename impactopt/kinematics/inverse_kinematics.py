@@ -136,7 +136,7 @@ def inverse_kinematics(
     # mass over the feet.
     ease = np.ones(model.nv)
     ease[:base] = 0.02
-    best_gap, nearest = np.inf, np.zeros(3)  # striking point of the best posture
+    best_gap, nearest = np.inf, list[Array]()  # striking points of the best posture
     for k in range(starts):
         q = guess.copy()
         # off the guess: an arm in its plane of symmetry would stay there, whatever the orientation
@@ -161,7 +161,7 @@ def inverse_kinematics(
             off = float(np.abs(np.concatenate(errors)).max())
             gap = max(float(np.linalg.norm(error)) for error in errors)
             if gap < best_gap:
-                best_gap, nearest = gap, np.array(data.oMf[hands[0][0]].translation)
+                best_gap, nearest = gap, [data.oMf[fid].translation.copy() for fid, _ in hands]
             orienting = facing is not None and iteration < FACING_STEPS
             if off < tolerance and (not orienting or np.abs(step).max() < FACING_STEP):
                 return q
@@ -195,17 +195,20 @@ def inverse_kinematics(
             # Linearization is good for some tenths of a radian.
             q = pin.integrate(model, q, np.clip(step, -0.15, 0.15))
     pin.framesForwardKinematics(model, data, guess)
-    fid, point = hands[0]
-    start = data.oMf[fid].translation
+    start = [data.oMf[fid].translation for fid, _ in hands]
     names = " and ".join(f"'{name}'" for name, _ in aims)
     fixed = " with the soles in place" if coordinates.legs else ""
-    others = "".join(f" and {np.round(other, 4).tolist()} m" for _, other in hands[1:])
+    s, verb, they = ("", "is", "it starts") if len(hands) == 1 else ("s", "are", "they start")
     raise InputError(
-        f"the point {np.round(point, 4).tolist()} m{others} is out of reach of {names}{fixed}: "
-        f"the nearest posture found is off by {best_gap:.3g} m, with the striking point at "
-        f"{np.round(nearest, 3).tolist()} m (it starts at {np.round(start, 3).tolist()} m); move the point "
-        "nearer to that"
+        f"the point{s} {_written([aim for _, aim in hands], 4)} {verb} out of reach of {names}{fixed}: the "
+        f"nearest posture found is off by {best_gap:.3g} m, with the striking point{s} at "
+        f"{_written(nearest, 3)} ({they} at {_written(start, 3)}); move the point{s} nearer to that"
     ) from None
+
+
+def _written(points: Sequence[Array], digits: int) -> str:
+    """Points (3,) [m] in a message."""
+    return " and ".join(f"{np.round(point, digits).tolist()} m" for point in points)
 
 
 def _least_rotation(axis: Array, direction: Array, across: Array) -> Array:

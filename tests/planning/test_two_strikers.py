@@ -286,7 +286,7 @@ def test_what_two_cannot_do_is_refused(problem: ImpactProblem) -> None:
             replace(problem, **changes)  # type: ignore[arg-type]
     far = SecondStriker(striker="left_hand", point=np.array([2.0, 0.2, 1.0]))
     # the first point is in reach: that alone would be the wrong one to move
-    with pytest.raises(InputError, match=r"with the striking points at \[.*\] m and \[.*\] m \(they start at"):
+    with pytest.raises(InputError, match=r"the striking points at \[.*\] m and \[.*\] m \(they start at"):
         replace(problem, second=far)
     with pytest.raises(InputError, match="point"):
         SecondStriker(striker="left_hand", point=np.array([0.5, np.nan, 1.0]))

@@ -11,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.files.record import Record, replay_name
+from impactopt.kinematics.coordinates import StanceCoordinates, independent_rates
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
@@ -173,12 +174,24 @@ def _planned(problem: ImpactProblem, record: Record, chosen: NDArray[np.intp]) -
     """Configurations (k, nq) of the plan at instants of its reference."""
     a, c = record.arrays, problem.coordinates
     q, contact = a["reference_q"][chosen], a["reference_phase"][chosen] == 1
-    # an impact without duration has no motion, and records of older versions do not have it
-    if (motion := a.get("collision_motion")) is not None and len(motion):
-        since = a["reference_time"][chosen][contact] - float(a["reference_contact_start"])
-        y = moved_in_contact(a["collision_time"], motion, since)
+    start, end = (float(a[f"reference_contact_{end}"]) for end in ("start", "end"))
+    if end > start:  # else an impact without duration, which has no motion
+        since = a["reference_time"][chosen][contact] - start
+        y = moved_in_contact(*_contact_states(a, c), since)
         q[contact] = [posture for posture, _ in c.leg_closure.follow(y, c.start_legs)]
     return np.asarray(q)
+
+
+def _contact_states(a: Mapping[str, Array], c: StanceCoordinates) -> tuple[Array, Array]:
+    """Times (m,) [s] since contact, and independent coordinates and rates (m, 2, ny) of a collision."""
+    if len(a.get("collision_motion", ())):
+        return a["collision_time"], a["collision_motion"]
+    # records of older versions have the states before and after it only
+    inside = np.flatnonzero(a["reference_phase"] == 1)
+    ends = [inside[0], min(inside[-1] + 1, len(a["reference_q"]) - 1)]
+    y = np.array([c.split(q)[0] for q in a["reference_q"][ends]])
+    rates = [independent_rates(c, *each) for each in zip(y, a["reference_v"][ends], strict=True)]
+    return a["reference_time"][ends] - a["reference_time"][ends[0]], np.stack([y, rates], axis=1)
 
 
 def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, Array]:

@@ -400,12 +400,18 @@ def test_the_motion_for_a_missing_target_is_there_without_the_target(
     assert [t["missing"] for t in header["tracks"]] == [False, False, False, True]
 
 
-def test_in_contact_the_planned_robot_moves_on_between_its_planned_states(biped_plan: Any) -> None:
-    """The reference coasts and jumps back; what is drawn has the plan's states and rates at both ends."""
+@pytest.mark.parametrize("older", [False, True])
+def test_in_contact_the_planned_robot_moves_on_between_its_planned_states(
+    biped_plan: Any, older: bool
+) -> None:
+    """The reference coasts and jumps back; what is drawn has the plan's states and rates at both ends, also
+    of a record of an older version, without states within the collision.
+    """
     plan, problem = biped_plan.plan, biped_plan.problem
     solved = still_solution(problem=problem)
     made = record_of(type(solved)(**{**vars(solved), "plan": plan}))
-    (track,) = tracks_of(made, problem)
+    kept = {name: a for name, a in made.arrays.items() if not older or name != "collision_motion"}
+    (track,) = tracks_of(dataclasses.replace(made, arrays=kept), problem)
     start, end = plan.contact_start, plan.contact_end
     rate = np.diff(track.hand, axis=0) / np.maximum(np.diff(track.time), 1e-12)[:, None]
     inside = (track.time[:-1] >= start) & (track.time[1:] <= end) & (np.diff(track.time) > 0)
@@ -413,6 +419,8 @@ def test_in_contact_the_planned_robot_moves_on_between_its_planned_states(biped_
     assert float(rate[inside][0] @ normal) == pytest.approx(plan.hand_speed, rel=0.15)
     steps = np.linalg.norm(np.diff(track.hand, axis=0), axis=1)
     assert steps[inside].max() < 1.5 * np.abs(rate[inside]).max() * 2.1e-3, "no jump"
+    last = np.flatnonzero(track.time <= end)[-2:]  # both sides of the reference's jump
+    np.testing.assert_allclose(*track.hand[last], atol=1e-5)
     coasting = biped_plan.trajectory
     jump = np.flatnonzero((np.diff(coasting.phase) == 1) & (coasting.phase[:-1] == 1))[0]
     assert np.abs(pin.difference(problem.robot.model, *coasting.q[jump : jump + 2])).max() > 1e-3, (

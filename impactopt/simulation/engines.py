@@ -23,7 +23,7 @@ from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.pinocchio_robot import recursive_body
-from impactopt.simulation.result import FACE, Scene, Simulation
+from impactopt.simulation.result import FACE, Scene, Simulation, state_at_contact
 from impactopt.transcription.plan import Trajectory
 
 
@@ -309,7 +309,12 @@ def simulate(
     simulation = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
     name, beyond = problem.robot.ranges.excess(problem.robot.joint_positions(simulation.q))
     beyond_range = (name, beyond) if beyond > ALLOWED_RANGE else ("", 0.0)
-    simulation = replace(simulation, expected=float(reference.contact_start), beyond_range=beyond_range)
+    simulation = replace(
+        simulation,
+        expected=float(reference.contact_start),
+        expected_state=state_at_contact(reference),
+        beyond_range=beyond_range,
+    )
     perturbation = options.get("perturbation") or Perturbation()
     return with_clearance(problem, simulation, perturbation.distance)
 

@@ -164,6 +164,7 @@ class Simulation:
         ``broken``)
     missed : there was no target
     expected [s] : begin of contact in the reference
+    expected_state (nq + nv,) : configuration and velocity of the reference there
     step_error : estimated relative error of the impulse by the engine's steps; nan if it was not computed, or
         nothing was hit
 
@@ -215,6 +216,7 @@ class Simulation:
     nearest: tuple[str, ...] = ()
     missed: bool = False
     expected: float = np.nan
+    expected_state: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     touches: tuple[tuple[float, float, float], ...] = ()
     contact_time: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     contact_force: Array = field(default_factory=lambda: np.zeros(0), repr=False)
@@ -399,6 +401,12 @@ class Simulation:
         given["torque_ratio"] = max(ratios.values())
         given |= {"zmp_margin_by_phase_m": margins, "torque_ratio_by_phase": ratios}
         return {name: given.get(name) for name in REPORT}
+
+
+def state_at_contact(reference: Any) -> Array:
+    """Configuration and velocity (nq + nv,) of a reference at the begin of contact."""
+    k = np.flatnonzero(reference.phase == 0)[-1]
+    return np.concatenate([reference.q[k], reference.v[k]])
 
 
 _NEXT, _PREVIOUS = [1, 2, 0], [2, 0, 1]  # axes

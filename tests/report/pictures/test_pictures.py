@@ -22,7 +22,7 @@ from support.picture_checks import frowns
 from support.small_plans import Planned
 from typer.testing import CliRunner
 
-from impactopt import Ground, InputError, Solution, effective_mass
+from impactopt import FreeMass, Ground, InputError, Phase, Solution, effective_mass, load_problem, solve
 from impactopt.files.output import record_of
 from impactopt.files.record import Record
 from impactopt.kinematics.support import zmp
@@ -419,6 +419,18 @@ def test_simulations_of_another_plan_are_refused(arm_plan: Planned, hammered: So
         with pytest.raises(InputError, match="simulation is of another plan: give this solution's"):
             solution.plot("force", simulation=other)
     assert hammered.plot("force", simulation=hammered.validate())
+
+
+def test_a_simulation_of_a_plan_of_the_same_duration_is_refused() -> None:
+    """All plans whose swing has a given duration meet their targets at the same time."""
+    problem = dataclasses.replace(load_problem("arm_planar"), swing=Phase(duration=(0.4, 0.4)))
+    problem = dataclasses.replace(problem, target=FreeMass(mass=1.0))
+    light = solve(problem)
+    heavy, simulation = light.moved(mass=1.3), light.validate()
+    assert heavy.trajectory.contact_start == light.trajectory.contact_start
+    with pytest.raises(InputError, match="simulation is of another plan"):
+        heavy.plot("force", simulation=simulation)
+    assert light.plot("force", simulation=simulation)
 
 
 @pytest.mark.parametrize("name", ["ax", "simulation", "replay"])

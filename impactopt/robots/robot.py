@@ -418,6 +418,7 @@ class Robot:
 
     def with_grip(self, name: str, grip: SoftGrip) -> Robot:
         """A copy of the robot with a soft grip for its rigidly held tool of that name."""
+        check_kind("grip", grip, SoftGrip)
         return dataclasses.replace(self, **tools.fields_with_grip(self, name, grip))
 
     @property

@@ -352,6 +352,8 @@ def test_parts_of_another_type_are_refused() -> None:
         robot.with_striker("fist")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="tool must be a Tool, not 'hammer'"):
         robot.with_tool("hammer")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="grip must be a SoftGrip, not None"):  # was left rigid
+        robot.with_grip("hammer", None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation.result import centre_of_pressure, travelled
-from impactopt.transcription.plan import Trajectory, moved_in_contact, pushed_aside
+from impactopt.transcription.plan import Trajectory, pushed_aside
 
 Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
@@ -82,8 +82,9 @@ def planned_track(solution: Solution, reference: Trajectory | None = None) -> Tr
     ------
     InputError : the plan's motion cannot be completed.
     """
-    parts: dict[str, Any] = {"reference": reference or solution.trajectory, "collision": solution.collision}
-    arrays = {"polygon": solution.plan.polygon}
+    reference, plan = reference or solution.trajectory, solution.plan
+    parts: dict[str, Any] = {"reference": reference, "collision": solution.collision}
+    arrays = {"polygon": plan.polygon, "collision_q": plan.in_contact(reference)}
     for prefix, part in parts.items():
         arrays |= {f"{prefix}_{f.name}": getattr(part, f.name) for f in fields(part)}
     record = Record(summary={"target": solution.collision.outcome}, arrays=arrays)
@@ -98,7 +99,7 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
     chosen = _instants(time, start, end, float(a["reference_end"]) + AFTER)
     shown = time[chosen]
     if prefix == "reference":
-        q = _planned(problem, record, chosen)
+        q = _planned(record, chosen)
         wrench, force, speed = _predicted(record, chosen)
     elif prefix == MISSED:
         q, wrench, start, end = a["missed_q"][chosen], a["missed_ground"][chosen], np.nan, np.nan
@@ -169,16 +170,14 @@ def _instants(time: Array, start: float, end: float, last: float) -> NDArray[np.
     return np.unique(np.concatenate([before, at]).clip(0, len(time) - 1))  # both sides of a jump
 
 
-def _planned(problem: ImpactProblem, record: Record, chosen: NDArray[np.intp]) -> Array:
+def _planned(record: Record, chosen: NDArray[np.intp]) -> Array:
     """Configurations (k, nq) of the plan at instants of its reference."""
-    a, c = record.arrays, problem.coordinates
-    q, contact = a["reference_q"][chosen], a["reference_phase"][chosen] == 1
-    # an impact without duration has no motion, and records of older versions do not have it
-    if (motion := a.get("collision_motion")) is not None and len(motion):
-        since = a["reference_time"][chosen][contact] - float(a["reference_contact_start"])
-        y = moved_in_contact(a["collision_time"], motion, since)
-        q[contact] = [posture for posture, _ in c.leg_closure.follow(y, c.start_legs)]
-    return np.asarray(q)
+    a = record.arrays
+    q, contact = a["reference_q"].copy(), a["reference_phase"] == 1
+    # records of older versions do not have it
+    if len(moved := a.get("collision_q", ())) == contact.sum():
+        q[contact] = moved
+    return np.asarray(q[chosen])
 
 
 def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, Array]:

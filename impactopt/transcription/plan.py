@@ -300,17 +300,6 @@ def pushed_aside(time: Array, velocity: Array, since: Array) -> Array:
     return np.asarray(within + np.maximum(since - time[-1], 0.0)[:, None] * velocity[-1])
 
 
-def moved_in_contact(time: Array, motion: Array, since: Array) -> Array:
-    """Independent coordinates (k, ny) of the robot at times (k,) [s] since contact.
-
-    time (m,), motion (m, 2, ny) : of `PlannedCollision`.
-    """
-    # Between all states of the collision: between its first and its last one alone, a link would be up to
-    # 10 mm off (preset punch_g1), as a light hand loses its speed at once.
-    y, rates = motion.swapaxes(0, 1)
-    return np.asarray(CubicHermiteSpline(time, y, rates)(since))
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedCollision:
     """Predicted collision of a plan, at contact and at the m collocation points.
@@ -679,6 +668,11 @@ class Plan:
             aside=np.zeros((len(time), 3)) if missed else self.aside(time),
         )
 
+    def in_contact(self, reference: Trajectory) -> Array:
+        """Expected configurations (k, nq) at the instants of a reference in contact, as of :meth:`motion`."""
+        expected = self.motion(reference)
+        return expected.q[expected.phase == 1]
+
     def through_contact(self, s: Array, *, missed: bool = False) -> Array:
         """Independent coordinates (k, ny) at fractions s (k,) of the contact.
 
@@ -687,7 +681,10 @@ class Plan:
         t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
         if missed or not len(self.collision.motion):
             return self.independent(1, t0 + (t1 - t0) * s, missed=missed)[0]
-        return moved_in_contact(self.collision.time, self.collision.motion, (t1 - t0) * s)
+        # Between all states of the collision: between its first and its last one alone, a link would be up to
+        # 10 mm off (preset punch_g1), as a light hand loses its speed at once.
+        y, rates = self.collision.motion.swapaxes(0, 1)
+        return np.asarray(CubicHermiteSpline(self.collision.time, y, rates)((t1 - t0) * s))
 
     def travel(self, time: Array) -> Array:
         """Displacement (k,) [m] of the target along the normal at times (k,) [s] since the motion's start.

@@ -109,7 +109,7 @@ class RobotBodies:
                 # Balls first: most pairs are far apart, and exact distances of all pairs of
                 # pieces would take much longer.
                 between = np.linalg.norm(data.oMi[a].act(centre_a) - data.oMi[b].act(centre_b))
-                far = between > radius_a + radius_b
+                far = between > radius_a + radius_b + FITTED
                 for one in self.of_joint[a]:
                     for two in self.of_joint[b]:
                         if frozenset((one.link, two.link)) in excluded:

@@ -142,7 +142,7 @@ def overlapping(problem: ImpactProblem) -> str:
     named = [f"{one!r} and {other!r}" for one, other in pairs[:3]]
     more = [f"{counted(len(pairs) - 3, 'more pair')}"] if len(pairs) > 3 else []
     return (
-        f"links touch in the start posture and may penetrate each other in the motion: "
+        f"links touch in the start posture, or nearly, and may penetrate each other in the motion: "
         f"{', '.join(named + more)}; start from another posture, or name them in disable_collisions"
     )
 

@@ -81,8 +81,10 @@ def record_of(
         if given is None:
             continue
         check_kind(name, given, Simulation)
-        other = abs(given.expected - solution.trajectory.contact_start) > 0  # nan: unknown
-        if other or given.q.shape[1] != robot.model.nq:
+        own, at = solution.trajectory, given.expected_posture  # (0,): unknown, as a time that is nan
+        other = abs(given.expected - own.contact_start) > 0 or given.q.shape[1] != robot.model.nq
+        # plans with a swing of one length begin their contact at one time
+        if other or (at.size and not np.allclose(at, own.posture_at_contact, rtol=0, atol=1e-6)):
             raise InputError(f"{name} is of another plan: give this solution's, of validate()")
     arrays = _scene_arrays(solution.problem)
     parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}

@@ -309,7 +309,12 @@ def simulate(
     simulation = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
     name, beyond = problem.robot.ranges.excess(problem.robot.joint_positions(simulation.q))
     beyond_range = (name, beyond) if beyond > ALLOWED_RANGE else ("", 0.0)
-    simulation = replace(simulation, expected=float(reference.contact_start), beyond_range=beyond_range)
+    simulation = replace(
+        simulation,
+        expected=float(reference.contact_start),
+        expected_posture=reference.posture_at_contact,
+        beyond_range=beyond_range,
+    )
     perturbation = options.get("perturbation") or Perturbation()
     return with_clearance(problem, simulation, perturbation.distance)
 

@@ -163,7 +163,7 @@ class Simulation:
     outcome : the target's result after the last touch, by name and unit (``speed_m_s``, ``depth_m``,
         ``broken``)
     missed : there was no target
-    expected [s] : begin of contact in the reference
+    expected [s], expected_posture (nq,) : begin of contact in the reference, and its posture there
     step_error : estimated relative error of the impulse by the engine's steps; nan if it was not computed, or
         nothing was hit
 
@@ -215,6 +215,7 @@ class Simulation:
     nearest: tuple[str, ...] = ()
     missed: bool = False
     expected: float = np.nan
+    expected_posture: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     touches: tuple[tuple[float, float, float], ...] = ()
     contact_time: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     contact_force: Array = field(default_factory=lambda: np.zeros(0), repr=False)

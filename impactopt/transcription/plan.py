@@ -233,6 +233,11 @@ class Trajectory:
     end: float
     stance: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
 
+    @property
+    def posture_at_contact(self) -> Array:
+        """Posture (nq,) in which contact begins."""
+        return np.asarray(self.q[np.argmax(self.phase == 1)])
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedStand:

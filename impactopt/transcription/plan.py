@@ -239,7 +239,7 @@ class Trajectory:
         return np.asarray(self.q[np.argmax(self.phase == 1)])
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedStand:
     """Stance phase other than the one with the impact.
 
@@ -280,7 +280,7 @@ class Piece(NamedTuple):
         return *self.spline.sample(local), np.stack(w, axis=1) if nw else np.zeros((len(ts), 0))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """Motion of the bodies at k instants.
 
@@ -900,7 +900,7 @@ def _loads(robot: Robot, motion: tuple[Array, ...], hit: PlannedCollision, jump:
     return DriveLoads.of(robot, gear=gear, torque=torque, velocity=velocity, jump=jump)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedStrike:
     """Planned impact alone: the robot's state at contact, and the prediction of the collision.
 

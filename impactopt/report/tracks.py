@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from impactopt.files.record import Record, replay_name
 from impactopt.planning.solution import Solution
@@ -99,7 +100,7 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
     chosen = _instants(time, start, end, float(a["reference_end"]) + AFTER)
     shown = time[chosen]
     if prefix == "reference":
-        q = _planned(record, chosen)
+        q = _planned(robot.model, record, chosen)
         wrench, force, speed = _predicted(record, chosen)
     elif prefix == MISSED:
         q, wrench, start, end = a["missed_q"][chosen], a["missed_ground"][chosen], np.nan, np.nan
@@ -170,13 +171,18 @@ def _instants(time: Array, start: float, end: float, last: float) -> NDArray[np.
     return np.unique(np.concatenate([before, at]).clip(0, len(time) - 1))  # both sides of a jump
 
 
-def _planned(record: Record, chosen: NDArray[np.intp]) -> Array:
+def _planned(model: Any, record: Record, chosen: NDArray[np.intp]) -> Array:
     """Configurations (k, nq) of the plan at instants of its reference."""
     a = record.arrays
-    q, contact = a["reference_q"].copy(), a["reference_phase"] == 1
-    # records of older versions do not have it
-    if len(moved := a.get("collision_q", ())) == contact.sum():
+    time, q, contact = a["reference_time"], a["reference_q"].copy(), np.flatnonzero(a["reference_phase"] == 1)
+    if len(moved := a.get("collision_q", ())) == len(contact):
         q[contact] = moved
+    elif len(contact):  # records of older versions do not have it: between the states before and after
+        ends = [contact[0], min(contact[-1] + 1, len(time) - 1)]
+        if time[ends[1]] > time[ends[0]]:
+            offsets = [np.zeros(model.nv), pin.difference(model, *q[ends])]
+            between = CubicHermiteSpline(time[ends], offsets, a["reference_v"][ends])
+            q[contact] = [pin.integrate(model, q[ends[0]], offset) for offset in between(time[contact])]
     return np.asarray(q[chosen])
 
 

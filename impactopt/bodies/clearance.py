@@ -128,7 +128,9 @@ class Bodies:
         standing: tuple[int, ...],
         strict: bool,
     ) -> None:
-        """start (nq,) : posture; links within 2 mm in it are not checked.  normal (3,) : of the target.
+        """start (nq,) : posture; links that touch in it, or nearly (`FITTED`), are not checked.
+
+        normal (3,) : of the target.
 
         strict : refuse a start posture that penetrates a body of the world.
         striking, standing : joints of the striking links, and of the feet on fixed soles.

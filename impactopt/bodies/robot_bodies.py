@@ -20,7 +20,7 @@ from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
 Pair = tuple[int, int]
-# [m] Links no farther apart than this in the start posture count as touching: they are made to fit, as a
+# [m] Neighbours no farther apart than this in the start posture count as touching: they are made to fit, as a
 # joint in its fork, and constraints know the shapes of two links no better (`separation.THIN`, of each).
 # Rounding would decide one on a share of so small a distance: Fourier's N1, whose shoulders are 0.6 mm apart,
 # took 581 iterations with them, and takes 55 without; iCub Erzelli02 (1.25 mm) 731 and 220.
@@ -92,8 +92,8 @@ class RobotBodies:
         """Pairs of pieces that can collide, by their two joints; and names of the links that touch at ``q``.
 
         Left out are links that a joint connects, those of ``disabled`` (names of two links each), and those
-        whose hulls touch in the start posture ``q`` (nq,), or nearly (`FITTED`), as neighbours beyond a short
-        link always do.
+        whose hulls touch in the start posture ``q`` (nq,), or nearly (`FITTED`) if few joints are between
+        them, as neighbours beyond a short link always do.
         """
         model, data = self.robot.model, self.robot.model.createData()
         pin.forwardKinematics(model, data, q)
@@ -109,12 +109,14 @@ class RobotBodies:
                 # Balls first: most pairs are far apart, and exact distances of all pairs of
                 # pieces would take much longer.
                 between = np.linalg.norm(data.oMi[a].act(centre_a) - data.oMi[b].act(centre_b))
-                far = between > radius_a + radius_b
+                # a hand that begins near a thigh is not made to fit it, and keeps its clearance
+                near = FITTED if self.joints_between(a, b) < NEIGHBOUR_JOINTS else 0.0
+                far = between > radius_a + radius_b + near
                 for one in self.of_joint[a]:
                     for two in self.of_joint[b]:
                         if frozenset((one.link, two.link)) in excluded:
                             continue
-                        if not far and distance(one.shape, places[a], two.shape, places[b]) <= FITTED:
+                        if not far and distance(one.shape, places[a], two.shape, places[b]) <= near:
                             touching.append((one.link, two.link))
                         else:
                             kept.append((one, two))

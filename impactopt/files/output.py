@@ -99,6 +99,8 @@ def record_of(
         parts |= {"reference": solution.trajectory, "pose": poses_of(solution.problem, solution.trajectory)}
         if plan.abort is not None:
             parts["missed"] = solution.missed_trajectory
+        with contextlib.suppress(InputError):  # legs out of reach in between
+            arrays["collision_q"] = plan.in_contact(solution.trajectory)
     if simulation is not None:
         parts["simulated"] = simulation
     if replay is not None:
@@ -188,6 +190,7 @@ def _parts_arrays(parts: Mapping[str, Any], result: SolverResult) -> dict[str, A
     out: dict[str, Any] = {}
     for prefix, thing in parts.items():
         out |= {f"{prefix}_{name}": value for name, value in _numbers(thing).items()}
+    out.pop("collision_motion", None)  # `collision_q` has it, which can be drawn without a stance
     if result.history:
         history = [_numbers(iteration) for iteration in result.history]
         out |= {f"history_{name}": [iteration[name] for iteration in history] for name in history[0]}

@@ -46,7 +46,7 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
     "replayed": {**_MOTION, **_HISTORIES, "soles": "s"},
     "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"}
     | {"ground": "g 6", "sole_wrench": "g w"}
-    | {"motion": "? m 2 y"}
+    | {"q": "? c nq"}
     | dict.fromkeys(("velocity", "acceleration"), "? p n")
     | {"tangential_velocity": "? m 3"},
     "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "normal": "3", "contact": ""}

@@ -60,16 +60,18 @@ def hopeless(problem: ImpactProblem) -> list[str]:
 
 
 def _too_light(problem: ImpactProblem) -> str:
-    """Message if the least forces of the soles that stand at first exceed the weight, which is all that they
-    bear at rest; else "".
+    """Message if the soles' least forces exceed the weight, which is all that they bear on average from start
+    to rest; else "".
     """
-    soles, least = len(problem.stance_coordinates[0].legs), problem.term(ContactWrenchCone).minimum_force
+    soles, least = len(problem.coordinates.legs), problem.term(ContactWrenchCone).minimum_force
     weight = weight_of(problem.robot)
-    if problem.stance.held_hands(problem.robot) or soles * least <= weight:  # hands may pull it down
+    # Hands and a target above may press it down; soles may bear more before a step, and less in it.
+    pressed = problem.stance.held_hands(problem.robot) or problem.normal[2] > 0
+    if pressed or problem.stances or soles * least <= weight:
         return ""
     return (
         f"the robot is too light: [terms.contact_wrench_cone] minimum_force_N asks {least:g} N of each of "
-        f"{counted(soles, 'sole')}, and it weighs {weight:.3g} N; give less than {weight / soles:.2g} N"
+        f"{counted(soles, 'sole')}, and it weighs {weight:.3g} N; give less than {weight / soles:.3g} N"
     )
 
 
@@ -140,7 +142,7 @@ def overlapping(problem: ImpactProblem) -> str:
     named = [f"{one!r} and {other!r}" for one, other in pairs[:3]]
     more = [f"{counted(len(pairs) - 3, 'more pair')}"] if len(pairs) > 3 else []
     return (
-        f"links touch in the start posture and may penetrate each other in the motion: "
+        f"links touch in the start posture, and may penetrate each other in the motion: "
         f"{', '.join(named + more)}; start from another posture, or name them in disable_collisions"
     )
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from impactopt.files.record import Record, replay_name
-from impactopt.kinematics.coordinates import StanceCoordinates, independent_rates
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation.result import centre_of_pressure, travelled
-from impactopt.transcription.plan import Trajectory, moved_in_contact, pushed_aside
+from impactopt.transcription.plan import Trajectory, pushed_aside
 
 Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
@@ -83,8 +83,9 @@ def planned_track(solution: Solution, reference: Trajectory | None = None) -> Tr
     ------
     InputError : the plan's motion cannot be completed.
     """
-    parts: dict[str, Any] = {"reference": reference or solution.trajectory, "collision": solution.collision}
-    arrays = {"polygon": solution.plan.polygon}
+    reference, plan = reference or solution.trajectory, solution.plan
+    parts: dict[str, Any] = {"reference": reference, "collision": solution.collision}
+    arrays = {"polygon": plan.polygon, "collision_q": plan.in_contact(reference)}
     for prefix, part in parts.items():
         arrays |= {f"{prefix}_{f.name}": getattr(part, f.name) for f in fields(part)}
     record = Record(summary={"target": solution.collision.outcome}, arrays=arrays)
@@ -99,7 +100,7 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
     chosen = _instants(time, start, end, float(a["reference_end"]) + AFTER)
     shown = time[chosen]
     if prefix == "reference":
-        q = _planned(problem, record, chosen)
+        q = _planned(robot.model, record, chosen)
         wrench, force, speed = _predicted(record, chosen)
     elif prefix == MISSED:
         q, wrench, start, end = a["missed_q"][chosen], a["missed_ground"][chosen], np.nan, np.nan
@@ -170,28 +171,19 @@ def _instants(time: Array, start: float, end: float, last: float) -> NDArray[np.
     return np.unique(np.concatenate([before, at]).clip(0, len(time) - 1))  # both sides of a jump
 
 
-def _planned(problem: ImpactProblem, record: Record, chosen: NDArray[np.intp]) -> Array:
+def _planned(model: Any, record: Record, chosen: NDArray[np.intp]) -> Array:
     """Configurations (k, nq) of the plan at instants of its reference."""
-    a, c = record.arrays, problem.coordinates
-    q, contact = a["reference_q"][chosen], a["reference_phase"][chosen] == 1
-    start, end = (float(a[f"reference_contact_{end}"]) for end in ("start", "end"))
-    if end > start:  # else an impact without duration, which has no motion
-        since = a["reference_time"][chosen][contact] - start
-        y = moved_in_contact(*_contact_states(a, c), since)
-        q[contact] = [posture for posture, _ in c.leg_closure.follow(y, c.start_legs)]
-    return np.asarray(q)
-
-
-def _contact_states(a: Mapping[str, Array], c: StanceCoordinates) -> tuple[Array, Array]:
-    """Times (m,) [s] since contact, and independent coordinates and rates (m, 2, ny) of a collision."""
-    if len(a.get("collision_motion", ())):
-        return a["collision_time"], a["collision_motion"]
-    # records of older versions have the states before and after it only
-    inside = np.flatnonzero(a["reference_phase"] == 1)
-    ends = [inside[0], min(inside[-1] + 1, len(a["reference_q"]) - 1)]
-    y = np.array([c.split(q)[0] for q in a["reference_q"][ends]])
-    rates = [independent_rates(c, *each) for each in zip(y, a["reference_v"][ends], strict=True)]
-    return a["reference_time"][ends] - a["reference_time"][ends[0]], np.stack([y, rates], axis=1)
+    a = record.arrays
+    time, q, contact = a["reference_time"], a["reference_q"].copy(), np.flatnonzero(a["reference_phase"] == 1)
+    if len(moved := a.get("collision_q", ())) == len(contact):
+        q[contact] = moved
+    elif len(contact):  # records of older versions do not have it: between the states before and after
+        ends = [contact[0], min(contact[-1] + 1, len(time) - 1)]
+        if time[ends[1]] > time[ends[0]]:
+            offsets = [np.zeros(model.nv), pin.difference(model, *q[ends])]
+            between = CubicHermiteSpline(time[ends], offsets, a["reference_v"][ends])
+            q[contact] = [pin.integrate(model, q[ends[0]], offset) for offset in between(time[contact])]
+    return np.asarray(q[chosen])
 
 
 def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, Array]:

@@ -234,7 +234,7 @@ class Trajectory:
     stance: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedStand:
     """Stance phase other than the one with the impact.
 
@@ -275,7 +275,7 @@ class Piece(NamedTuple):
         return *self.spline.sample(local), np.stack(w, axis=1) if nw else np.zeros((len(ts), 0))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """Motion of the bodies at k instants.
 
@@ -298,17 +298,6 @@ def pushed_aside(time: Array, velocity: Array, since: Array) -> Array:
     moved = cumulative_trapezoid(velocity, time, axis=0, initial=0.0)
     within = np.column_stack([np.interp(since, time, x) for x in moved.T])
     return np.asarray(within + np.maximum(since - time[-1], 0.0)[:, None] * velocity[-1])
-
-
-def moved_in_contact(time: Array, motion: Array, since: Array) -> Array:
-    """Independent coordinates (k, ny) of the robot at times (k,) [s] since contact.
-
-    time (m,), motion (m, 2, ny) : of `PlannedCollision`.
-    """
-    # Between all states of the collision: between its first and its last one alone, a link would be up to
-    # 10 mm off (preset punch_g1), as a light hand loses its speed at once.
-    y, rates = motion.swapaxes(0, 1)
-    return np.asarray(CubicHermiteSpline(time, y, rates)(since))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -679,6 +668,11 @@ class Plan:
             aside=np.zeros((len(time), 3)) if missed else self.aside(time),
         )
 
+    def in_contact(self, reference: Trajectory) -> Array:
+        """Expected configurations (k, nq) at the instants of a reference in contact, as of :meth:`motion`."""
+        expected = self.motion(reference)
+        return expected.q[expected.phase == 1]
+
     def through_contact(self, s: Array, *, missed: bool = False) -> Array:
         """Independent coordinates (k, ny) at fractions s (k,) of the contact.
 
@@ -687,7 +681,10 @@ class Plan:
         t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
         if missed or not len(self.collision.motion):
             return self.independent(1, t0 + (t1 - t0) * s, missed=missed)[0]
-        return moved_in_contact(self.collision.time, self.collision.motion, (t1 - t0) * s)
+        # Between all states of the collision: between its first and its last one alone, a link would be up to
+        # 10 mm off (preset punch_g1), as a light hand loses its speed at once.
+        y, rates = self.collision.motion.swapaxes(0, 1)
+        return np.asarray(CubicHermiteSpline(self.collision.time, y, rates)((t1 - t0) * s))
 
     def travel(self, time: Array) -> Array:
         """Displacement (k,) [m] of the target along the normal at times (k,) [s] since the motion's start.
@@ -898,7 +895,7 @@ def _loads(robot: Robot, motion: tuple[Array, ...], hit: PlannedCollision, jump:
     return DriveLoads.of(robot, gear=gear, torque=torque, velocity=velocity, jump=jump)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedStrike:
     """Planned impact alone: the robot's state at contact, and the prediction of the collision.
 

@@ -37,7 +37,7 @@ from impactopt import (
     talos,
 )
 from impactopt.bodies.clearance import FAR, MISSED, SLACK, Bodies, Places
-from impactopt.bodies.convex_hulls import inertia_box, pieces_of
+from impactopt.bodies.convex_hulls import Piece, inertia_box, pieces_of
 from impactopt.bodies.file_shapes import lost_meshes
 from impactopt.bodies.robot_bodies import bodies_of, distance
 from impactopt.bodies.world import BEHIND, WorldBody, face_axes, ground_body, obstacle_bodies, target_bodies
@@ -332,6 +332,36 @@ def test_links_that_fit_into_each_other_touch(apart: float, touch: bool) -> None
     pairs, touching = bodies.links.piece_pairs(q)
     assert (pair in pairs) != touch
     assert bool(touching) == touch
+
+
+@pytest.mark.parametrize(("apart", "touch"), [(1.5e-3, True), (3e-3, False)])
+def test_pointed_links_that_fit_touch(apart: float, touch: bool) -> None:
+    """Two octahedra, tip to tip, are as far apart as the balls around them."""
+    problem = arm_problem()
+    q, model, pair = problem.start_posture, problem.robot.model, max(problem.bodies.pairs)
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    one, other = (data.oMi[joint] for joint in pair)
+    between = np.linalg.norm(other.translation - one.translation)
+    radius = 0.5 * (float(between) - apart)
+    along = (other.translation - one.translation) / between
+    axes = np.linalg.qr(np.column_stack([along, np.eye(3)]))[0]
+    pieces = []
+    for joint, place in zip(pair, (one, other), strict=True):
+        turned = radius * place.rotation.T @ axes
+        vertices = np.vstack([turned.T, -turned.T])
+        corners = [
+            (k, i, j) if np.linalg.det(vertices[[k, i, j]]) > 0 else (k, j, i)
+            for k in (0, 3)
+            for i in (1, 4)
+            for j in (2, 5)
+        ]
+        pieces.append(
+            Piece(link=f"link {joint}", joint=joint, vertices=vertices, triangles=np.array(corners))
+        )
+    links = dataclasses.replace(problem.bodies.links, pieces=tuple(pieces))
+    pairs, touching = links.piece_pairs(q)
+    assert (len(pairs), len(touching)) == ((0, 1) if touch else (1, 0))
 
 
 def test_links_that_may_pass_through_each_other_are_no_pair() -> None:

@@ -45,6 +45,7 @@ from impactopt import (
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
 from impactopt.files.replay import load_planned, problem_of, resumed
+from impactopt.kinematics.operational_space import striking_point
 from impactopt.live import plan_page as look_module
 from impactopt.live import replanning as replanning_module
 from impactopt.live.drawing import moment_of
@@ -295,6 +296,19 @@ def test_a_solutions_track_is_its_records(arm: Solution) -> None:
             np.testing.assert_allclose(found, own, rtol=0, atol=1e-8, equal_nan=True)
         else:
             np.testing.assert_equal(found, own)
+
+
+def test_a_record_of_an_older_version_shows_no_coasting_robot(arm: Solution) -> None:
+    """It has no motion in contact: the reference coasts centimetres into the target, and jumps back."""
+    record, reference = record_of(arm), arm.trajectory
+    own = tracks_of(record, arm.problem)[0]
+    arrays = {name: array for name, array in record.arrays.items() if name != "collision_q"}
+    older = tracks_of(dataclasses.replace(record, arrays=arrays), arm.problem)[0]
+    at_end = reference.q[reference.phase == 1][-1]
+    coasted = striking_point(arm.problem.robot, arm.problem.striker, at_end)
+    end = np.flatnonzero(own.time == own.contact_end)[0]
+    assert np.linalg.norm(coasted - own.hand[end]) > 0.01
+    np.testing.assert_allclose(older.hand, own.hand, rtol=0, atol=0.003)
 
 
 # ---- from a saved result

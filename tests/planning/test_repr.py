@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from impactopt import FreeMass, InputError, Solution, VirtualMass, striking_velocity
+from impactopt import FreeMass, InputError, Solution, VirtualMass, optimize_strike, striking_velocity
 from impactopt.files.output import record_of
 
 
@@ -18,7 +18,8 @@ def test_a_solution_is_one_line(hammered: Solution) -> None:
         assert type(thing).__name__ in repr(thing) and len(repr(thing)) < 130
     simulation = solution.validate()
     assert len(repr(simulation)) < 600
-    for thing in (solution.trajectory, solution.plan, solution.plan.collision, simulation):
+    plan, strike = solution.plan, optimize_strike(solution.problem).strike
+    for thing in (solution.trajectory, plan, plan.collision, plan.motion(), strike, simulation):
         assert len({thing, copy.copy(thing)}) == 2  # arrays neither compare nor hash
     p = solution.problem
     scene = {"robot": p.robot, "striker": p.striker, "normal": p.normal, "law": p.law}

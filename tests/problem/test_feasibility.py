@@ -87,6 +87,21 @@ def test_soles_that_must_bear_more_than_the_weight_are_told() -> None:
         assert all(f"minimum_force_N asks {least:g} N of each of 2 soles" in text for text in found)
 
 
+def test_soles_that_are_lifted_in_a_motion_may_bear_more_than_the_weight_before() -> None:
+    """`kick_g1` is solved so: 2 x 165 N, and it weighs 327 N."""
+    kick = load_problem("kick_g1")
+    terms = tuple(t for t in kick.terms if not isinstance(t, ContactWrenchCone))
+    cone = dataclasses.replace(kick.term(ContactWrenchCone), minimum_force=165.0)
+    assert 9.81 * pin.computeTotalMass(kick.robot.model) < 2 * 165.0
+    assert hopeless(dataclasses.replace(kick, terms=(*terms, cone))) == []
+
+
+def test_a_target_above_presses_the_soles_down() -> None:
+    problem = _punch([0.45, -0.2, 1.0], (0.0, 0.0, 1.0))
+    cone = ContactWrenchCone(minimum_force=0.51 * 9.81 * pin.computeTotalMass(problem.robot.model))
+    assert hopeless(dataclasses.replace(problem, terms=(cone,))) == hopeless(problem)
+
+
 def test_a_start_beyond_the_target_is_told_with_its_distance() -> None:
     start = _fist(_punch([0.45, -0.2, 1.0]))
     ahead = _punch(np.add(start, [0.08, 0.0, 0.0]).tolist(), (-1.0, 0.0, 0.0))

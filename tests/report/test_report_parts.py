@@ -15,6 +15,7 @@ from support.fake_solution import still_problem, still_solution
 
 from impactopt import (
     Board,
+    Free,
     FreeMass,
     InputError,
     KelvinVoigt,
@@ -367,6 +368,24 @@ def test_a_track_says_what_the_record_says(record: Record, solution: Solution) -
     assert planned.travel[-1] == pytest.approx(min(2.0 * (0.02 + end), FAR), abs=1e-3)
 
 
+def test_a_motion_in_contact_is_the_plans_in_a_problem_of_another_stance(solution: Solution) -> None:
+    """The stance of `show RESULT --problem FILE` has other coordinates: a page of it was a traceback."""
+    plan, problem = solution.plan, solution.problem
+    hit, (y, _) = plan.collision, problem.coordinates.split(problem.start_posture)
+    motion = np.stack([np.tile(y, (len(hit.time), 1)), np.zeros((len(hit.time), len(y)))], axis=1)
+    motion[:, 0, 2] -= 0.5 * hit.time  # the base sinks at 0.5 m/s
+    motion[:, 1, 2] = -0.5
+    sinking = dataclasses.replace(plan, collision=dataclasses.replace(hit, motion=motion))
+    record = record_of(dataclasses.replace(solution, plan=sinking))
+    drawn = [tracks_of(record, of)[0] for of in (problem, dataclasses.replace(problem, stance=Free()))]
+    for track in drawn:
+        contact = (track.time > track.contact_start) & (track.time < track.contact_end)
+        sunk = 0.5 * (track.time[contact] - track.contact_start)
+        assert contact.sum() > 5
+        np.testing.assert_allclose(track.places[0, 1, 2] - track.places[contact, 1, 2], sunk, atol=1e-9)
+    np.testing.assert_array_equal(drawn[0].places, drawn[1].places)
+
+
 def test_a_target_that_friction_pushes_aside_is_drawn_there(record: Record, solution: Solution) -> None:
     a, across = record.arrays, np.array([0.0, 0.5, -0.2])
     time = a["collision_time"]
@@ -410,7 +429,7 @@ def test_in_contact_the_planned_robot_moves_on_between_its_planned_states(
     plan, problem = biped_plan.plan, biped_plan.problem
     solved = still_solution(problem=problem)
     made = record_of(type(solved)(**{**vars(solved), "plan": plan}))
-    kept = {name: a for name, a in made.arrays.items() if not older or name != "collision_motion"}
+    kept = {name: a for name, a in made.arrays.items() if not older or name != "collision_q"}
     (track,) = tracks_of(dataclasses.replace(made, arrays=kept), problem)
     start, end = plan.contact_start, plan.contact_end
     rate = np.diff(track.hand, axis=0) / np.maximum(np.diff(track.time), 1e-12)[:, None]

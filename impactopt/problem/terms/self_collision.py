@@ -11,7 +11,8 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class SelfCollision(Term):
-    """Links of the robot have clearance, except where a joint connects them or they start within 2 mm.
+    """Links of the robot have clearance, except where a joint connects them or they touch at the start
+    (neighbours: start within 2 mm).
 
     It is required from start to rest, after a miss too. Other links that are nearer than the margin at
     the start may stay so near.

@@ -418,6 +418,11 @@ def test_simulations_of_another_plan_are_refused(arm_plan: Planned, hammered: So
     for other in (later, dataclasses.replace(own, q=np.zeros((len(own.time), 9)))):
         with pytest.raises(InputError, match="simulation is of another plan: give this solution's"):
             solution.plot("force", simulation=other)
+    moved = hammered.moved(point=hammered.problem.point + np.array([0.0, 0.0, 0.005])).validate()
+    # as of a swing of given duration
+    at_once = dataclasses.replace(moved, expected=hammered.trajectory.contact_start)
+    with pytest.raises(InputError, match="simulation is of another plan: give this solution's"):
+        hammered.plot("force", simulation=at_once)
     assert hammered.plot("force", simulation=hammered.validate())
 
 

@@ -46,6 +46,7 @@ def reference(
         q=np.broadcast_to(np.asarray(q, dtype=float), (k, np.shape(q)[-1])),
         v=np.zeros((k, nv)) if v is None else np.asarray(v, dtype=float),
         torque=np.zeros((k, n)) if torque is None else np.broadcast_to(torque, (k, n)),
+        phase=np.zeros(k, dtype=int),
         contact_start=np.nan,  # known to plans alone
         end=time[-1] if end is None else end,
     )

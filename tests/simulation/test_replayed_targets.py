@@ -50,7 +50,7 @@ from impactopt.simulation import (
     simulate_pinocchio,
 )
 from impactopt.simulation.engines import check_steps, longest_stable_step, with_step_error
-from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.ipm.interior_point import solve_ipm
 from impactopt.transcription.initial_guess import first_iterate
 
 Array = NDArray[np.float64]
@@ -313,7 +313,7 @@ def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[
         arm_problem(), robot=robot, law=law, target=target, terms=BODILESS, **changes
     )
     transcription = transcribed(problem)
-    result = solve_ipopt(transcription.program, first_iterate(transcription))
+    result = solve_ipm(transcription.program, first_iterate(transcription))
     assert result.status is Status.SOLVED, result.message
     plan = transcription.decode(result.x)
     motion = dataclasses.replace(plan.trajectory(), end=plan.contact_end + 0.01)  # the blow is what counts

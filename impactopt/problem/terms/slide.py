@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Slide(Term):
-    """The striking point stays near the hit point until contact ends.
+    """The striking point is near the hit point as contact ends.
 
-    Its offset along each of two tangents is bounded, with the expected target. With little friction or none,
-    a long push at an angle may slide off the target, whose face ends 0.2 m from the hit point in replays, or
-    from a `HitRegion`. The hit point is where the striking point meets the target, anywhere in a `HitRegion`;
+    Its offset there along each of two tangents is bounded, with the expected target; on the way there it may
+    be larger (`slide_mm` in `summary.json`). With little friction or none, a long push at an angle may slide
+    off the target, whose face ends 0.2 m from the hit point in replays, or from a `HitRegion`. The hit point is where the striking point meets the target, anywhere in a `HitRegion`;
     it stays there also on a target that friction moves across the normal.
 
     The term holds with its defaults in every problem. Its constraints are added once a plan violates them, or

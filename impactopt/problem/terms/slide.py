@@ -25,8 +25,9 @@ class Slide(Term):
 
     Its offset there along each of two tangents is bounded, with the expected target; on the way there it may
     be larger (`slide_mm` in `summary.json`). With little friction or none, a long push at an angle may slide
-    off the target, whose face ends 0.2 m from the hit point in replays, or from a `HitRegion`. The hit point is where the striking point meets the target, anywhere in a `HitRegion`;
-    it stays there also on a target that friction moves across the normal.
+    off the target, whose face ends 0.2 m from the hit point in replays, or from a `HitRegion`. The hit point
+    is where the striking point meets the target, anywhere in a `HitRegion`; it stays there also on a target
+    that friction moves across the normal.
 
     The term holds with its defaults in every problem. Its constraints are added once a plan violates them, or
     from the start if the problem gives the term, also in strikes.

@@ -45,7 +45,7 @@ from impactopt.planning.strike import clear_strike
 from impactopt.problem.feasibility import blocked, hopeless
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.strength import drawn_posture, strongest_posture
+from impactopt.problem.strength import drawn_posture
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.mesh import NO_MORE
@@ -351,7 +351,7 @@ def _else_from_other_posture(
     From the strongest posture there may be no motion, such as to a soft board that breaks; nor from the one
     nearest to the start, where an arm bends the other way.
     """
-    p, used = t.problem, strongest_posture(t.problem)
+    p, used = t.problem, t.postures[0]  # of the first start
     posture = p.contact_posture
     # Postures come of iterations: equal ones differ in their last digits.
     if np.allclose(posture, used, atol=_SAME_POSTURE):

@@ -368,7 +368,7 @@ def best_share(problem: ImpactProblem) -> tuple[float, EstimatedImpact] | None:
     p = problem
     if p.robot.floating or p.second is not None or not isinstance(p.target, FreeMass):
         return None
-    strength = Strength(robot=p.robot, striker=p.striker, law=p.law, target=p.target)
+    strength = _strength(p)
     drawn = drawn_impacts(
         strength, p.start_posture, (*NORMALS, p.normal), with_face=p.term(FirstTouch).enabled
     )

@@ -73,22 +73,27 @@ def slide(problem: ImpactProblem, plan: Plan) -> float:
     # An impact without duration: nothing slides.
     if len(plan.collision.time) < 2 or plan.collision.time[-1] <= 0:
         return 0.0
+    moved = plan.collision.aside(np.linspace(0.0, plan.collision.time[-1], CONTACT_SAMPLES))
+    on_target = _offsets(plan) - moved @ across(problem.normal).T
+    return float(np.linalg.norm(on_target, axis=1).max())
+
+
+def _offsets(plan: Plan) -> Array:
+    """Offsets (CONTACT_SAMPLES, 2) [m] of the striking point from the hit point along two tangents, during
+    contact.
+    """
+    problem = plan.problem
     postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, CONTACT_SAMPLES)))
     points = striking_point(problem.robot, problem.striker, postures)
-    points -= plan.collision.aside(np.linspace(0.0, plan.collision.time[-1], CONTACT_SAMPLES))
-    tangential = (points - points[0]) @ across(problem.normal).T
-    return float(np.linalg.norm(tangential, axis=1).max())
+    return (points - points[0]) @ across(problem.normal).T
 
 
 def slides_beyond(term: Slide, plan: Plan) -> str:
-    """Message with the striking point's slide as contact ends; "" if it is within the limit along each
-    tangent, but for a tolerance.
+    """Message with the striking point's slide; "" if it is within the limit along each tangent, but for a
+    tolerance.
     """
-    problem = plan.problem
-    ends = plan.closed(plan.through_contact(np.array([0.0, 1.0])))
-    begin, end = striking_point(problem.robot, problem.striker, ends)
     # The constraint bounds the offset along each tangent, so it is a square, not a circle.
-    far = float(np.abs(across(problem.normal) @ (end - begin)).max())
+    far = float(np.abs(_offsets(plan)).max())
     if far <= (1 + SLIDE_TOLERANCE) * term.most:
         return ""
     most = f"at most {1e3 * term.most:.0f} mm allowed"

@@ -520,6 +520,10 @@ class Collision(ContactParameters):
         """Wrenches on soles and supporting hands at each stage."""
         return [(self._place(s), self.w[i]) for i, s in enumerate(self.stages)]
 
+    def positions(self) -> list[tuple[Place, list[Affine]]]:
+        """Place, and the first slots of `_motion`, which are y, at each stage."""
+        return [(self._place(s), self._motion(i)[:5]) for i, s in enumerate(self.stages)]
+
     def _motion(self, i: int) -> list[Affine]:
         """Slots of `impactopt.problem.block.joint_motion` at a stage."""
         # value and slope of u, which is ydot already: so the S of ydot = r/S is one

@@ -183,6 +183,12 @@ class ContactProgram(ABC):
         nodes = [(place, slots[4]) for place, slots in self._node_slots()]
         return [*nodes, *(found for collision in self.hit.lasting for found in collision.wrenches())]
 
+    def positions_in_contact(self) -> list[tuple[Place, list[Affine]]]:
+        """Slots y0, d1, T1, d, T of the coordinates y = y0 + T1 d1 + T d at the collocation points of the
+        expected collision, where y0 is at contact; none for an impact without duration.
+        """
+        return self.expected.positions() if isinstance(self.expected, Collision) else []
+
     def first_instants(self) -> list[tuple[Place, Index]]:
         """First instants of damped contacts, if a term needs them.
 

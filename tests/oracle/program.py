@@ -306,18 +306,21 @@ class Program:
         return float(self.problem.normal @ self.robot.striking(*self.state_at_contact(v))[1])
 
     def _slide(self) -> None:
-        """How far across the target the striker has moved as contact ends."""
-        term, begin, still = self.problem.extra(Slide), self.ways[1].at(0.0), np.zeros(self.robot.ny)
+        """How far across the target the striker has moved at each stage of the expected blow."""
+        term, blow, still = self.problem.extra(Slide), self.blows[0], np.zeros(self.robot.ny)
         if term is None or not term.enabled:
             return
-        tangents = self._tangents
+        tangents, names = self._tangents, ["tangent 1", "tangent 2"]
+        for i in range(len(blow.stages)):
 
-        def value(v: Variables) -> Array:
-            hit, end = (self.robot.striking(y, still)[0] for y in (self.at_contact(v), begin(v)[0]))
-            return tangents @ (end - hit)
+            def value(v: Variables, i: int = i) -> Array:
+                begin = self.at_contact(v)
+                places = (begin, blow.moved(v, i, begin)[0])
+                hit, now = (self.robot.striking(y, still)[0] for y in places)
+                return tangents @ (now - hit)
 
-        names = ["tangent 1", "tangent 2"]
-        self.rows.append(Piece.of(value, [(term.name, "after contact", names, -term.most, term.most)]))
+            rows = [(term.name, blow.place(i), names, -term.most, term.most)]
+            self.rows.append(Piece.of(value, rows))
 
     def _reference_range(self) -> None:
         """How far the joints are of a reference that has coasted until contact ends."""

@@ -56,19 +56,12 @@ def test_a_slide_is_the_way_across_the_normal(plan: Plan) -> None:
 
 
 def test_a_bound_keeps_it_short(plan: Plan) -> None:
-    """It is along each of two tangents, at the end of contact; the way there may be longer."""
+    """It is along each of two tangents, all the time that contact lasts."""
     most = 0.3 * slide(plan.problem, plan)
     t = transcribed(replace(plan.problem, terms=(*plan.problem.terms, Slide(most=most))))
     kept = t.decode(solve_ipopt(t.program, first_iterate(t)).x)
-    y = kept.through_contact(np.array([1.0]))[0]
-    model = kept.problem.robot.model
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, kept.coordinates.join(y, np.zeros(0)))
-    striker = kept.problem.robot.striker(kept.problem.striker).model_frame
-    end = data.oMf[model.getFrameId(striker)].translation - kept.problem.point
-    assert np.linalg.norm(end - (end @ kept.problem.normal) * kept.problem.normal) < 1.001 * np.sqrt(2) * most
-    assert slide(kept.problem, kept) < slide(plan.problem, plan)
-    assert kept.impulse == pytest.approx(plan.impulse, rel=0.05)
+    assert slide(kept.problem, kept) < 1.01 * np.sqrt(2) * most
+    assert 0.5 * plan.impulse < kept.impulse < plan.impulse
 
 
 def test_only_a_long_slide_is_told() -> None:
@@ -112,7 +105,7 @@ def test_in_a_region_a_slide_begins_where_the_striker_hits() -> None:
     assert np.abs(hit - across(problem.normal) @ aim).max() > 1.5 * Slide().most
     program = transcribed(replace(problem, terms=(*BODILESS, region, Slide()))).program
     rows = [i for i in range(program.m) if program.constraint_name(i).startswith("slide")]
-    np.testing.assert_allclose(program.constraints(found.result.x)[rows], end - hit, atol=1e-6)
+    np.testing.assert_allclose(program.constraints(found.result.x)[rows[-2:]], end - hit, atol=1e-6)
 
 
 def test_the_face_in_replays_is_beyond_the_region() -> None:

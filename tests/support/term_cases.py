@@ -125,12 +125,15 @@ def target_speed(plan: Solved, term: TargetSpeed) -> float:
 
 
 def slid(plan: Solved, term: Slide) -> float:
-    """Along the tangent in which it is farther."""
+    """Along the tangent in which it is farther, at the collision's states."""
     problem = plan.plan.problem
-    q = plan.plan.coordinates.join(plan.plan.follow.sample(0.0)[0][0], np.zeros(0))
-    way = np.array(plan.frame(f"striker:{problem.striker}", q).translation) - problem.point
     _, _, rows = np.linalg.svd(problem.normal.reshape(1, 3))
-    return float(np.abs(rows[1:] @ way).max()) / term.most
+    far = 0.0
+    for y, _ in plan.plan.collision.motion:
+        q = plan.plan.coordinates.join(y, np.zeros(0))
+        way = np.array(plan.frame(f"striker:{problem.striker}", q).translation) - problem.point
+        far = max(far, float(np.abs(rows[1:] @ way).max()))
+    return far / term.most
 
 
 def coasted(plan: Solved, term: ReferenceRange) -> float:

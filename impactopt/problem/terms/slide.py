@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Slide(Term):
-    """The striking point is near the hit point as contact ends.
+    """The striking point is near the hit point until contact ends.
 
-    Its offset there along each of two tangents is bounded, with the expected target; on the way there it may
-    be larger (`slide_mm` in `summary.json`). With little friction or none, a long push at an angle may slide
-    off the target, whose face ends 0.2 m from the hit point in replays, or from a `HitRegion`. The hit point
-    is where the striking point meets the target, anywhere in a `HitRegion`; it stays there also on a target
-    that friction moves across the normal.
+    Its offset along each of two tangents is bounded at the collocation points of the collision with the
+    expected target (`slide_mm` in `summary.json`: the largest). With little friction or none, a long push at
+    an angle may slide off the target, whose face ends 0.2 m from the hit point in replays, or from a
+    `HitRegion`. The hit point is where the striking point meets the target, anywhere in a `HitRegion`; it
+    stays there also on a target that friction moves across the normal.
 
     The term holds with its defaults in every problem. Its constraints are added once a plan violates them, or
     from the start if the problem gives the term, also in strikes.
@@ -42,28 +42,31 @@ class Slide(Term):
         return {"slide": BlockRecipe(lambda: slide(coordinates, problem.striker))}
 
     def add_constraints(self, program: Any) -> None:
-        after = program.follow_spots()[0][1][0]
-        slots, tangents = [program.contact_state[0], after], across(program.problem.normal)
-        at = program.add_block("slide", [slots], tangents.ravel())
-        program.constraints.add(
-            term=self.name,
-            place="after contact",
-            components=["tangent 1", "tangent 2"],
-            outputs=at + np.arange(2),
-            lower=-self.most,
-            upper=self.most,
-            measure=millimetres("too far"),
-        )
+        # none in an impact without duration: nothing slides
+        points, tangents = program.positions_in_contact(), across(program.problem.normal)
+        at = program.add_block("slide", [slots for _, slots in points], tangents.ravel())
+        for k, (place, _) in enumerate(points):
+            program.constraints.add(
+                term=self.name,
+                place=place,
+                components=["tangent 1", "tangent 2"],
+                outputs=at + 2 * k + np.arange(2),
+                lower=-self.most,
+                upper=self.most,
+                measure=millimetres("too far"),
+            )
 
 
 def slide(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """Slide of the striking point across the target during contact.
+    """Slide of the striking point across the target since contact.
 
-    z = y at contact, y after it;  p = tangents (6, one after the other);  out = slide along each [m].
+    z = of `ContactProgram.positions_in_contact`;  p = tangents (6, one after the other);  out = slide along
+    each [m].
     """
-    y, after = ca.SX.sym("y", c.ny), ca.SX.sym("after", c.ny)
-    tangents, zero = ca.SX.sym("tangents", 6), ca.SX.zeros(c.ny)
+    y, d1, d = (ca.SX.sym(name, c.ny) for name in ("y", "d1", "d"))
+    T1, T = ca.SX.sym("T1"), ca.SX.sym("T")
+    after, tangents, zero = y + T1 * d1 + T * d, ca.SX.sym("tangents", 6), ca.SX.zeros(c.ny)
     at = striker_kinematics(c, striker)
     begin, end = (at(*c.upper_motion(each, zero, zero)[:2], ca.SX.zeros(c.rb.nv))[0] for each in (y, after))
     moved = ca.mtimes(ca.reshape(tangents, 3, 2).T, end - begin)
-    return make_block([y, after], [tangents], {"moved": moved}, lanes=1)
+    return make_block([y, d1, T1, d, T], [tangents], {"moved": moved}, lanes=1)

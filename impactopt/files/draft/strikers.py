@@ -139,7 +139,8 @@ def _away(model: pin.Model, limb: Limb) -> Array:
         step = tip.translation - data.oMi[joint].translation
         if np.linalg.norm(step) > APART:
             return np.asarray(tip.rotation.T @ step / np.linalg.norm(step))
-    return np.array([0.0, 0.0, 1.0])
+    slides = axis_of(model, limb.tip).subspace[:3]  # zero for a revolute joint
+    return np.array(slides) if slides.any() else np.array([0.0, 0.0, 1.0])  # a ram pushes along its joint
 
 
 def _axis(

@@ -16,7 +16,7 @@ from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.draft.hits import Hit
-from impactopt.files.draft.target_placement import LOWEST, Arm
+from impactopt.files.draft.target_placement import LOWEST, Arm, rounded_point
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.strike import optimize_strike
@@ -152,9 +152,7 @@ def strike_problem(
     behind : least distance [m] of the start behind the target's plane.  given : other arguments of
     `ImpactProblem`.  clipped : joints with less range than their run-up begin at its end.
     """
-    # fewer than three joints reach a curve or a surface only, from which rounding would move the point
-    joints = len(robot.limb(robot.striker(striker).model_frame))
-    point = np.round(impact.point, 3 if joints > 2 else 9) + 0.0
+    point = rounded_point(robot, striker, impact.point)
     size = float(np.abs(impact.v).max())
     way = impact.v / size * float(np.clip(RUN_UP * size, *TRAVEL))
     for factor in TRAVEL_FACTORS:

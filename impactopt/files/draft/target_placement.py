@@ -93,4 +93,11 @@ def aims(robot: Robot, arm: Arm, q: Array, direction: Array) -> Iterator[Array]:
             point[2] += part * (max(root[2], LOWEST) - start[2])
         gap = bend_arm(robot, arm.limb, arm.name, arm.axis, q, point, direction)[1]
         if gap < NEAR and (point - start) @ direction > 0.1 * length:
-            yield np.round(point, 3) + 0.0
+            yield rounded_point(robot, arm.name, point)
+
+
+def rounded_point(robot: Robot, striker: str, point: Array) -> Array:
+    """A hit point (3,) [m] to the millimetre, where the striker has joints enough to reach that."""
+    # fewer than three joints reach a curve or a surface only, from which rounding would move the point
+    joints = len(robot.limb(robot.striker(striker).model_frame))
+    return np.round(point, 3 if joints > 2 else 9) + 0.0

@@ -1247,10 +1247,10 @@ def test_a_ram_strikes_along_its_joint(tmp_path: Path) -> None:
     """A link without shapes and offsets, which reaches nothing but its own line."""
     ram = urdfs.link("ram", 2.0, (0.1, 0.1, 0.1), (0, 0, 0))
     ram = re.sub("<collision>.*</collision>", "", ram)
-    slide = urdfs.joint("slide", "base", "ram", "1 0 0", (0, 0, 1.0004), (-1, 1), kind="prismatic", effort=500)
-    problem = _problem(
-        tmp_path, urdfs.robot("one", urdfs.link("base", 1.0, (0.1, 0.1, 0.1), (0, 0, 0)), ram, slide)
-    )
+    at, options = (0, 0, 1.0004), {"kind": "prismatic", "effort": 500.0}
+    slide = urdfs.joint("slide", "base", "ram", "1 0 0", at, (-1, 1), **options)
+    base = urdfs.link("base", 1.0, (0.1, 0.1, 0.1), (0, 0, 0))
+    problem = _problem(tmp_path, urdfs.robot("one", base, ram, slide))
     assert problem.point[1:] == pytest.approx([0.0, 1.0004], abs=1e-9)
     assert problem.normal == pytest.approx([1.0, 0.0, 0.0])
     assert solve(problem).status.usable

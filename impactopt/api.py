@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 
@@ -184,7 +184,7 @@ class Solution(solution.Solution):
         rate: float | None = None,
         joints: Sequence[str] | None = None,
         gravity: bool = True,
-        smooth: tuple[float, float] | None = None,
+        smooth: Literal["terms"] | tuple[float, float] | None = None,
     ) -> list[Path]:
         """Writes the plan for other programs, ``solution.export("csv", "results/csv")``; returns the files.
 

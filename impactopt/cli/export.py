@@ -50,9 +50,10 @@ def export(
     smooth: Annotated[
         str | None,
         typer.Option(
-            metavar="A,J",
-            help="Smooth: the nearest motion with at most A rad/s^2 and J rad/s^3, for bolted arms whose "
-            "controllers refuse more.",
+            metavar="A,J|terms",
+            help="Smooth: the nearest motion with at most A rad/s^2 and J rad/s^3, or the limits in "
+            "[terms.joint_acceleration] and [terms.joint_jerk], for bolted arms whose controllers refuse "
+            "more.",
         ),
     ] = None,
     problem: OtherProblem = None,
@@ -117,12 +118,14 @@ def export(
             typer.echo(printable(NEXT[to].format(directory=shlex.quote(str(directory)))))
 
 
-def _limits(given: str) -> tuple[float, float]:
+def _limits(given: str) -> Literal["terms"] | tuple[float, float]:
     """Acceleration and jerk of `--smooth A,J`."""
+    if given == "terms":
+        return "terms"
     try:
         acceleration, jerk = (float(word) for word in given.split(","))
     except ValueError:
         raise typer.BadParameter(
-            f"{given!r}; give two numbers, such as 15,5000", param_hint="--smooth"
+            f"{given!r}; give two numbers, such as 15,5000, or terms", param_hint="--smooth"
         ) from None
     return acceleration, jerk

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -298,6 +299,14 @@ class MotionPhase:
     def motion(self) -> list[tuple[Place, list[Affine]]]:
         """Places of the nodes with y, y', y'', legs and T [s], by which ydot = y'/T and yddot = y''/T^2."""
         return [(place, [*slots[:4], slots[5]]) for slots, place in zip(*self.instances(), strict=True)]
+
+    def third_derivatives(self) -> list[tuple[Place, list[Affine]]]:
+        """Places of the spline's intervals with y''' (ny), which is constant there, and T [s]."""
+        out = []
+        for a, b in pairwise(self.breaks.tolist()):
+            third = (self.at(b)[2] - self.at(a)[2]) * (1 / (b - a))
+            out.append((self.place_at((a + b) / 2), [third, self.T[0]]))
+        return out
 
     def spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
         """Places of the nodes with coordinates and legs, from fraction ``since`` of the phase on."""

@@ -220,9 +220,13 @@ class Transcription(ContactProgram):
     def swing_spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
         return self.swing.spots(since)
 
-    def swing_motion(self) -> list[tuple[Place, list[Affine]]]:
-        """Places of the swing's nodes with y, y', y'', legs and T [s]; ydot = y'/T."""
-        return self.swing.motion()
+    def motion(self) -> list[tuple[Place, list[Affine]]]:
+        """Nodes of swing, follow-through and abort motion, as of `MotionPhase.motion`."""
+        return [spot for phase in (self.swing, *self.follows) for spot in phase.motion()]
+
+    def third_derivatives(self) -> list[tuple[Place, list[Affine]]]:
+        """Intervals of swing, follow-through and abort motion, as of `MotionPhase.third_derivatives`."""
+        return [part for phase in (self.swing, *self.follows) for part in phase.third_derivatives()]
 
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
         return [spot for follow in self.follows for spot in follow.spots()]

@@ -1323,6 +1323,19 @@ def test_a_floating_mjcf_that_does_not_stand_is_bolted_and_told(tmp_path: Path) 
     assert not draft_robot(xml, mjcf=True, bolted=True).fixed
 
 
+@pytest.mark.slow
+def test_a_draft_keeps_the_limits_that_a_robot_s_manufacturer_publishes(tmp_path: Path) -> None:
+    draft = draft_problem(find_description("panda"), folder=tmp_path, planned=False)
+    assert "(Franka Control Interface documentation" in draft.text
+    (tmp_path / "panda.toml").write_text(draft.text)
+    plan = solve(load_problem(tmp_path / "panda.toml"))
+    assert plan.status.usable
+    limit = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])
+    away = plan.trajectory.phase != 1  # in contact the reference coasts
+    used = np.abs(plan.trajectory.a[away]).max(axis=0) / limit
+    assert 0.99 < used.max() < 1.001
+
+
 def test_robots_of_example_robot_data_go_by_name() -> None:
     pytest.importorskip("pinocchio")
     try:

@@ -38,6 +38,8 @@ from impactopt import (
     ImpactProblem,
     Impulse,
     InputError,
+    JointAcceleration,
+    JointJerk,
     KelvinVoigt,
     Perturbation,
     RigidWall,
@@ -321,6 +323,8 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
         export_planned(
             dataclasses.replace(planned, reference=farther), "csv", tmp_path / "far", smooth=(0.1, 1.0)
         )
+    with pytest.raises(InputError, match="lacks limits of all joints"):
+        arm.export("csv", tmp_path / "none", smooth="terms")
     with pytest.raises(InputError, match="above 0"):
         arm.export("csv", tmp_path / "none", smooth=(0.0, 1.0))
     with pytest.raises(InputError, match=r"smooth: acceleration and jerk: expected shape \(2\)"):
@@ -406,6 +410,20 @@ def test_a_smoothed_motion_ends_at_rest_at_any_rate(arm: Solution, tmp_path: Pat
 
 
 @pytest.mark.slow
+def test_a_smoothed_motion_keeps_the_limits_of_the_problem_s_terms_by_joint(
+    planned: Planned, tmp_path: Path
+) -> None:
+    robot = planned.problem.robot
+    most = {joint: 40.0 + 20.0 * k for k, joint in enumerate(robot.joint_names)}
+    terms = (*planned.problem.terms, JointAcceleration(limit=most), JointJerk(limit=5000.0))
+    limited = dataclasses.replace(planned, problem=dataclasses.replace(planned.problem, terms=terms))
+    _, path = export_planned(limited, "csv", tmp_path / "csv", smooth="terms")[:2]
+    read = from_csv(path, robot)
+    used = np.abs(np.diff(read.v, axis=0) / np.diff(read.time)[:, None]).max(axis=0) / [*most.values()]
+    assert used.max() < 1 + 1e-6 and used.min() > 0.5  # each joint has its own limit
+
+
+@pytest.mark.slow
 def test_mcap_is_what_ros_reads(arm: Solution, tmp_path: Path) -> None:
     _, path = arm.export("mcap", tmp_path / "bag")
     messages = read_mcap(path)
@@ -420,6 +438,12 @@ def test_mcap_is_what_ros_reads(arm: Solution, tmp_path: Path) -> None:
     impulse = np.trapezoid(force, 1e-9 * time, axis=0)
     np.testing.assert_allclose(impulse, arm.impulse * arm.problem.normal, atol=0.02 * arm.impulse)
     assert {m.data for _, m in messages["/phase"]} == {0, 1, 2} and "/zmp" not in messages
+    states = messages["/joint_states"]
+    assert [t for t, _ in states] == [t for t, _ in messages["/phase"]]
+    for (_, state), point in zip(states, trajectory.points, strict=True):
+        assert state.name == trajectory.joint_names
+        for told, goal in ((state.position, point.positions), (state.effort, point.effort)):
+            np.testing.assert_array_equal(told, goal)
     with open(path, "rb") as file:
         (attached,) = make_reader(file).iter_attachments()
     assert attached.name == "meta.json"

@@ -20,6 +20,7 @@ from impactopt import (
     HitCone,
     HitRegion,
     JointAcceleration,
+    JointJerk,
     MotorCurve,
     Plan,
     PowerLimit,
@@ -106,12 +107,25 @@ def hit_cone(plan: Solved, term: HitCone) -> float:
 
 
 def joint_acceleration(plan: Solved, term: JointAcceleration) -> float:
-    """Of the arm's joints, which are its spline: everywhere, not at the nodes alone."""
-    spline, of_all = plan.plan.swing, not isinstance(term.limit, dict)
-    joints = plan.transcription.robot.joint_names
-    limit = np.array([term.limit if of_all else term.limit.get(joint, np.inf) for joint in joints])
-    accelerations = spline.sample(np.linspace(0, spline.duration, 1001))[2]
-    return float((np.abs(accelerations) / limit).max())
+    """Of the arm's joints, which are its splines: everywhere, not at the nodes alone."""
+    names, limit = plan.transcription.robot.joint_names, term.limit
+    most = np.array([limit.get(joint, np.inf) if isinstance(limit, dict) else limit for joint in names])
+    found = [
+        spline.sample(np.linspace(0, spline.duration, 1001))[2]
+        for spline in (plan.plan.swing, plan.plan.follow)
+    ]
+    return float((np.abs(np.concatenate(found)) / most).max())
+
+
+def joint_jerk(plan: Solved, term: JointJerk) -> float:
+    """By differences of accelerations inside of the splines' intervals."""
+    worst = 0.0
+    for spline in (plan.plan.swing, plan.plan.follow):
+        ends = spline.breaks * spline.duration
+        inside = ends[:-1, None] + np.outer(np.diff(ends), [0.2, 0.8])
+        one, two = (spline.sample(time)[2] for time in inside.T)
+        worst = max(worst, float(np.abs((two - one) / (0.6 * np.diff(ends))[:, None]).max()))
+    return worst / float(term.limit)  # type: ignore[arg-type]
 
 
 def velocity_jump(plan: Solved, term: VelocityJump) -> float:
@@ -176,6 +190,7 @@ CASES: dict[str, Case] = {
         JointAcceleration(limit=200.0),
         joint_acceleration,
     ),
+    "joint jerk": Case(JointJerk(limit=600.0), JointJerk(limit=800.0), JointJerk(limit=1e5), joint_jerk),
     "gear load": Case(GearLoad(limit=0.6), GearLoad(limit=0.7), GearLoad(limit=1.0)),
     "motor curve": Case(MotorCurve(fraction=0.2), MotorCurve(fraction=0.25), MotorCurve()),
     "power limit": Case(PowerLimit(limit=30.0), PowerLimit(limit=40.0), PowerLimit(limit=200.0)),

@@ -38,6 +38,42 @@ SERVO_MARGIN = 2.0  # largest rate of a servo over that on a guessed rotor alone
 DOUBT = "a GUESS"
 
 
+@dataclass(frozen=True, kw_only=True)
+class PublishedLimits:
+    """A manufacturer's limits of the commands that its controller takes.
+
+    joints : their names.  acceleration, jerk : limits of each [rad/s^2], [rad/s^3].  source : where they are
+    published.
+    """
+
+    joints: tuple[str, ...]
+    acceleration: tuple[float, ...]
+    jerk: tuple[float, ...]
+    source: str
+
+
+_FRANKA = "Franka Control Interface documentation, robot and interface specifications"
+PUBLISHED_LIMITS = (
+    PublishedLimits(
+        joints=tuple(f"panda_joint{k}" for k in range(1, 8)),
+        acceleration=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
+        jerk=(7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0),
+        source=_FRANKA,
+    ),
+    PublishedLimits(
+        joints=tuple(f"fr3_joint{k}" for k in range(1, 8)),
+        acceleration=(10.0,) * 7,
+        jerk=(5000.0,) * 7,
+        source=_FRANKA,
+    ),
+)
+
+
+def published_limits(joints: Collection[str]) -> PublishedLimits | None:
+    """Published limits of the robot with these joints; None if none are known."""
+    return next((known for known in PUBLISHED_LIMITS if set(known.joints) <= set(joints)), None)
+
+
 @dataclass(kw_only=True)
 class Drives:
     """Guesses by joint: armature [kg m2], torque [N m], velocity [rad/s] and position [rad] limits that the

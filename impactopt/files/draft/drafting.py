@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.convex_hulls import seen_pieces
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.errors import InputError, counted
-from impactopt.files.draft.default_drives import DOUBT
+from impactopt.files.draft.default_drives import DOUBT, published_limits
 from impactopt.files.draft.hits import Hit, hits
 from impactopt.files.draft.limbs import NO_RANGE, Limb, renumbered
 from impactopt.files.draft.postures import eased, half_sitting, rested
@@ -527,6 +527,12 @@ def _data(
             },
             "balance": {"angular_momentum_N_m_s": float(f"{min(10.0, 10 * part):.2g}")},
         }
+    if known := published_limits(robot.joint_names):
+        acceleration, jerk = (
+            dict(zip(known.joints, of, strict=True)) for of in (known.acceleration, known.jerk)
+        )
+        data.setdefault("terms", {})["joint_acceleration"] = {"limit_rad_s2": acceleration}
+        data["terms"]["joint_jerk"] = {"limit_rad_s3": jerk}
     return plain_value(data)
 
 
@@ -582,6 +588,8 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         "locked_rad": "; ".join(_reasons(drafted.locked)),
     }
 
+    known = published_limits(robot.joint_names)
+
     def comment(place: Place) -> str:
         if len(place) == 2 and place[0] == "robot" and str(place[1]) in guessed:
             return guessed[str(place[1])]
@@ -589,6 +597,8 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
             return "soles level, knees forward, arms bent" if data["robot"].get("soles") else "bent"
         if place == ("problem", "normal"):
             return f"{comment_at(data, place)}: {_in_words(np.array(data['problem']['normal']))}"
+        if known and place in (("terms", "joint_acceleration"), ("terms", "joint_jerk")):
+            return f"limits of its controller ({known.source}); leave them out for torque control"
         return comment_at(data, place)
 
     def hidden(place: Place) -> Mapping[str, Any]:

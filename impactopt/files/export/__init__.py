@@ -10,6 +10,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from impactopt.errors import InputError, check_choice
 from impactopt.files.export.content import check_export, export_of, write_directory
@@ -51,7 +52,7 @@ def export(
     rate: float | None = None,
     joints: Sequence[str] | None = None,
     gravity: bool = True,
-    smooth: tuple[float, float] | None = None,
+    smooth: Literal["terms"] | tuple[float, float] | None = None,
 ) -> list[Path]:
     """Write a plan for other programs; the paths of the files.
 
@@ -60,8 +61,9 @@ def export(
     rate [Hz] : of the samples; default 1000, for mjlab 50.
     joints : order of all joints in the columns; default the robot's own.
     gravity : False: effort without the torque that balances gravity, for arms whose controller adds it.
-    smooth : largest acceleration [rad/s^2] and jerk [rad/s^3] of all joints, for bolted arms whose
-        controllers refuse jumps: the nearest motion within these. ``meta.json`` has its impulse.
+    smooth : largest acceleration [rad/s^2] and jerk [rad/s^3] of all joints, or "terms" for the limits of
+        `JointAcceleration` and `JointJerk` in the problem, for bolted arms whose controllers refuse jumps:
+        the nearest motion within these. ``meta.json`` has its impulse.
 
     Raises
     ------
@@ -90,7 +92,7 @@ def export_planned(
     rate: float | None = None,
     joints: Sequence[str] | None = None,
     gravity: bool = True,
-    smooth: tuple[float, float] | None = None,
+    smooth: Literal["terms"] | tuple[float, float] | None = None,
 ) -> list[Path]:
     """Export of a saved plan; arguments as of `export`."""
     check_choice("there is no format", to, FORMATS)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -22,7 +22,7 @@ from impactopt import __version__
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.errors import InputError, check_array, check_choice, check_kind, check_number
+from impactopt.errors import InputError, check_choice, check_kind, check_number
 from impactopt.files.export.motion import JUMP, Motion, motion_at, with_passive_at_rest
 from impactopt.files.export.smooth import Smoothness, smoothed
 from impactopt.files.record import plain, read_json
@@ -133,7 +133,7 @@ class Export:
     order: NDArray[np.intp]
     rate: float
     gravity: bool
-    smooth: Mapping[str, float] | None
+    smooth: Mapping[str, Any] | None
     motion: Motion
     missed: Motion | None
 
@@ -242,12 +242,13 @@ def export_of(
     rate: float,
     joints: Sequence[str] | None = None,
     gravity: bool = True,
-    smooth: tuple[float, float] | None = None,
+    smooth: Literal["terms"] | tuple[float, float] | None = None,
 ) -> Export:
     """A plan sampled at a rate [Hz].
 
     joints : order in all columns; default the robot's own.  gravity : effort includes it.
-    smooth : largest acceleration [rad/s^2] and jerk [rad/s^3] of all joints; None: not smoothed.
+    smooth : largest acceleration [rad/s^2] and jerk [rad/s^3] of all joints; "terms": those of the problem's
+        terms; None: not smoothed.
 
     Raises
     ------
@@ -258,7 +259,7 @@ def export_of(
     check_kind("gravity", gravity, bool)
     robot = planned.problem.robot
     order = check_export(planned.record.summary.get("status"), robot, rate, joints)
-    smoothing: dict[str, float] | None = None
+    smoothing: dict[str, Any] | None = None
     if smooth is not None:
         planned, smoothing, replayed = _smoothed(planned, smooth)
     reference, missed = planned.reference, planned.missed
@@ -281,7 +282,9 @@ def export_of(
     )
 
 
-def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, dict[str, float], Simulation]:
+def _smoothed(
+    planned: Planned, limits: Literal["terms"] | tuple[float, float]
+) -> tuple[Planned, dict[str, Any], Simulation]:
     """The plan with a smoothed reference and without its abort motion, which would begin with a jump; limits
     and impulses of the smoothed motion in a replay; the replay, whose contact the plan's summary has.
 
@@ -294,8 +297,7 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
     InputError : no motion satisfies the limits; it does not hit the target, or presses more than it hits; it
         does not break a board that the plan breaks.
     """
-    acceleration, jerk = check_array("smooth: acceleration and jerk", limits, (2,))
-    within = Smoothness(acceleration=acceleration, jerk=jerk)
+    within = Smoothness.of(planned.problem, limits)
     reference = smoothed(planned.reference, planned.problem, within)
     replayed = simulate(planned.problem, reference)
     if not replayed.impulse:
@@ -304,8 +306,8 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
         jerk = np.diff(own, axis=0) / np.diff(time)[:, None]
         most, fastest = (float(f"{np.abs(x).max():.2g}") for x in (own, jerk))
         raise InputError(
-            f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "
-            f"does not hit the target; the plan's swing has up to {most:g} rad/s^2 and {fastest:g} rad/s^3: "
+            f"smooth: the motion with {within} does not hit the target; the plan's swing has up to "
+            f"{most:g} rad/s^2 and {fastest:g} rad/s^3: "
             "give larger limits, or plan with [terms.joint_acceleration]"
         )
     touches = np.array(replayed.touches)
@@ -314,23 +316,23 @@ def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, d
     pressing = whole - impulse
     if pressing > impulse:
         raise InputError(
-            f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "
-            f"brakes too late: it gives the target {impulse:.3g} N s in the impact, and then presses on it "
+            f"smooth: the motion with {within} brakes too late: it gives the target {impulse:.3g} N s in the "
+            "impact, and then presses on it "
             f"with {pressing:.3g} N s, until {touches[-1, 1] - touches[0, 0]:.2g} s after the first touch; "
             "give larger limits, or plan with a smaller fraction in [terms.velocity_limit]"
         )
     outcome = planned.record.summary.get("target") or {}
     if outcome.get("broken") and not replayed.outcome.get("broken", True):
         raise InputError(
-            f"smooth: the motion with at most {within.acceleration:g} rad/s^2 and {within.jerk:g} rad/s^3 "
-            f"does not break the board: it presses with {replayed.peak_force:.3g} N, the plan with "
+            f"smooth: the motion with {within} does not break the board: it presses with "
+            f"{replayed.peak_force:.3g} N, the plan with "
             f"{planned.record.summary['peak_force_N']:.3g} N; give larger limits"
         )
     driven = ~planned.problem.robot.passive
     ratio = np.abs(reference.torque[:, driven]) / planned.problem.robot.torque_limit[driven]
-    smoothing = {
-        "acceleration_rad_s2": within.acceleration,
-        "jerk_rad_s3": within.jerk,
+    smoothing: dict[str, Any] = {
+        "acceleration_rad_s2": within.limits[0] if limits == "terms" else within.limits[0][0],
+        "jerk_rad_s3": within.limits[1] if limits == "terms" else within.limits[1][0],
         "impulse_Ns": impulse,
         "planned_impulse_Ns": float(planned.record.summary["impulse_Ns"]),
         "pressing_Ns": pressing,

@@ -55,13 +55,17 @@ _TYPES: dict[str, tuple[str, tuple[str, ...]]] = {
         "std_msgs/Header header\ngeometry_msgs/Twist twist",
         (*_HEADER, "geometry_msgs/Vector3", "geometry_msgs/Twist"),
     ),
+    "sensor_msgs/msg/JointState": (
+        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort",
+        _HEADER,
+    ),
     "std_msgs/msg/UInt8": ("uint8 data", ()),
 }
 
 
 def write(export: Export, directory: Path) -> None:
-    """`motion.mcap`: topics /motion, /missed, /phase, /expected_force, /zmp, /base_pose, /base_twist, and for
-    a plan with stance phases /stance.
+    """`motion.mcap`: topics /motion, /missed, /joint_states, /phase, /expected_force, /zmp, /base_pose,
+    /base_twist, and for a plan with stance phases /stance.
 
     meta.json is an attachment.
 
@@ -114,6 +118,9 @@ def _trajectory(export: Export, motion: Motion) -> dict[str, Any]:
 def _messages(export: Export, motion: Motion, k: int) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Topics, types and messages of instant k."""
     header = _header(motion.time[k])
+    joints = {"position": motion.position, "velocity": motion.velocity, "effort": motion.effort}
+    state = {"name": list(export.joints), **{name: values[k].tolist() for name, values in joints.items()}}
+    yield "/joint_states", "sensor_msgs/msg/JointState", {"header": header, **state}
     yield "/phase", "std_msgs/msg/UInt8", {"data": int(motion.phase[k])}
     if motion.stance is not None:
         yield "/stance", "std_msgs/msg/UInt8", {"data": int(motion.stance[k])}

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from impactopt.errors import InputError, check_number
+from impactopt.errors import InputError, check_array
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import JointAcceleration, JointJerk
+from impactopt.problem.terms.base import of_joints
 from impactopt.transcription.plan import Trajectory, complete_reference
 
 Array = NDArray[np.float64]
@@ -24,20 +27,45 @@ SAMPLES_PER_STEP = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Smoothness:
-    """Limits of all joints: acceleration [rad/s^2] and jerk [rad/s^3]; for prismatic ones [m/s^2], [m/s^3].
-
-    Raises
-    ------
-    InputError : one of them is not positive.
+    """Limits by joint, (n,) each: acceleration [rad/s^2] and jerk [rad/s^3]; of prismatic ones [m/s^2],
+    [m/s^3].
     """
 
-    acceleration: float
-    jerk: float
+    acceleration: Array
+    jerk: Array
 
-    def __post_init__(self) -> None:
-        for name in ("acceleration", "jerk"):
-            if not check_number(f"smooth: {name}", getattr(self, name)) > 0:
+    @classmethod
+    def of(cls, problem: ImpactProblem, given: Literal["terms"] | tuple[float, float]) -> Smoothness:
+        """Limits of all joints, or those of the problem's terms.
+
+        Raises
+        ------
+        InputError : neither two positive numbers nor "terms"; a problem without limits of all joints.
+        """
+        names = problem.robot.joint_names
+        if given == "terms":
+            found = problem.extra(JointAcceleration), problem.extra(JointJerk)
+            limits = [of_joints(term.limit, names) for term in found if term is not None]
+            if len(limits) < 2 or not np.isfinite(limits).all():
+                raise InputError(
+                    "smooth: the problem lacks limits of all joints in [terms.joint_acceleration] and "
+                    "[terms.joint_jerk]; give them, or two numbers"
+                )
+            return cls(acceleration=limits[0], jerk=limits[1])
+        numbers = check_array("smooth: acceleration and jerk", given, (2,))
+        for name, number in zip(("acceleration", "jerk"), numbers, strict=True):
+            if not number > 0:
                 raise InputError(f"smooth: {name} has to be above 0")
+        return cls(acceleration=np.full(len(names), numbers[0]), jerk=np.full(len(names), numbers[1]))
+
+    def __str__(self) -> str:
+        acceleration, jerk = (", ".join(f"{x:g}" for x in dict.fromkeys(v)) for v in self.limits)
+        return f"at most {acceleration} rad/s^2 and {jerk} rad/s^3"
+
+    @property
+    def limits(self) -> tuple[list[float], list[float]]:
+        """Accelerations and jerks as lists of the joints."""
+        return self.acceleration.tolist(), self.jerk.tolist()
 
 
 def smoothed(reference: Trajectory, problem: ImpactProblem, limits: Smoothness) -> Trajectory:
@@ -70,7 +98,7 @@ def smoothed(reference: Trajectory, problem: ImpactProblem, limits: Smoothness) 
             np.interp(nodes, reference.time, position[:, k]),
             np.interp(nodes, reference.time, reference.v[:, k]),
             np.where(near, CONTACT_WEIGHT, 1.0),
-            limits,
+            (float(limits.acceleration[k]), float(limits.jerk[k])),
             (float(robot.lower[k]), float(robot.upper[k]), float(robot.velocity_limit[k])),
         )
         for k, name in enumerate(robot.joint_names)
@@ -101,15 +129,15 @@ def _joint(
     position: Array,
     velocity: Array,
     weight: Array,
-    limits: Smoothness,
+    limits: tuple[float, float],
     own: tuple[float, float, float],
 ) -> tuple[Array, Array, Array]:
     """Smoothed position, velocity and acceleration (k,) of one joint at nodes `step` [s] apart.
 
-    position, velocity (k,) : of the reference there.  weight (k,) : of deviations.  own : lower and upper
-    position limit, and velocity limit.
+    position, velocity (k,) : of the reference there.  weight (k,) : of deviations.  limits : of acceleration
+    and jerk.  own : lower and upper position limit, and velocity limit.
     """
-    k, h = len(position), step
+    k, h, (acceleration, jerk) = len(position), step, limits
     one = sp.identity(k, format="csr")
     here, increment = one[:-1], one[1:] - one[:-1]
     # Unknowns, (k,) each: position, velocity, acceleration, jerk, bounds of the deviations of position and
@@ -138,12 +166,12 @@ def _joint(
     # at both ends the joint is at rest, at the reference's position
     ends = np.zeros(k, dtype=bool)
     ends[[0, -1]] = True
-    at_rest = [np.where(ends, 0.0, most) for most in (fastest, limits.acceleration)]
-    upper = [np.where(ends, position, highest), *at_rest, np.full(k, limits.jerk)]
+    at_rest = [np.where(ends, 0.0, most) for most in (fastest, acceleration)]
+    upper = [np.where(ends, position, highest), *at_rest, np.full(k, jerk)]
     lower = [np.where(ends, position, lowest), *(-x for x in upper[1:])]
     # In units that make all numbers of order one, and not by the simplex method, which failed on some
     # programs in any units.
-    sizes = np.array([POSITION_TIME, 1.0, limits.acceleration, limits.jerk])
+    sizes = np.array([POSITION_TIME, 1.0, acceleration, jerk])
     column = np.repeat([*sizes, *sizes[:2]], k)
     equation, inequality = np.repeat(sizes[:3], k - 1), np.repeat(sizes[[0, 1, 1]], 2 * k)
     bounds = np.stack([[*lower, *np.zeros((2, k))], [*upper, *np.full((2, k), np.inf)]])
@@ -158,7 +186,7 @@ def _joint(
     )
     if found.status != 0:
         raise InputError(
-            f"smooth: no motion of {name} with at most {limits.acceleration:g} rad/s^2 and {limits.jerk:g} "
+            f"smooth: no motion of {name} with at most {acceleration:g} rad/s^2 and {jerk:g} "
             "rad/s^3 ends where the plan does; give larger limits, or plan a longer follow-through"
         )
     q, v, a = (column * found.x)[: 3 * k].reshape(3, k)

@@ -20,6 +20,7 @@ from impactopt.problem.terms.hit_cone import HitCone
 from impactopt.problem.terms.hit_region import HitRegion
 from impactopt.problem.terms.incidence import Incidence
 from impactopt.problem.terms.joint_acceleration import JointAcceleration
+from impactopt.problem.terms.joint_jerk import JointJerk
 from impactopt.problem.terms.keep_out import KeepOut
 from impactopt.problem.terms.leg_extension import LegExtension
 from impactopt.problem.terms.motor_curve import MotorCurve
@@ -57,6 +58,7 @@ TERMS: tuple[type[Term], ...] = (
     HitRegion,
     HitCone,
     JointAcceleration,
+    JointJerk,
     GearLoad,
     MotorCurve,
     PowerLimit,
@@ -83,6 +85,7 @@ __all__ = [
     "HitRegion",
     "Incidence",
     "JointAcceleration",
+    "JointJerk",
     "KeepOut",
     "LegExtension",
     "MotorCurve",

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class JointAcceleration(Term):
-    """|joint acceleration| is bounded during the swing, at its nodes.
+    """|joint acceleration| is bounded at the nodes of swing, follow-through and abort motion.
 
-    Accelerations of joints outside the legs are linear between nodes, so they are bounded everywhere. If the
-    limit is given by joint, other joints have no bound.
+    Accelerations of joints outside the legs are linear between nodes, so they are bounded everywhere but in
+    contact, where the servo's reference has none. If the limit is given by joint, other joints have no bound.
     """
 
     name: ClassVar[str] = "joint acceleration"
@@ -39,7 +39,7 @@ class JointAcceleration(Term):
     def add_constraints(self, program: Any) -> None:
         names = program.robot.joint_names
         limit = of_joints(self.limit, names)
-        spots = program.swing_motion()
+        spots = program.motion()
         at = program.add_block("joint_acceleration", [slots for _, slots in spots], np.zeros(0))
         for k, (place, _) in enumerate(spots):
             program.constraints.add(

@@ -1,0 +1,72 @@
+"""Bounds on joint jerks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.contact.fields import about
+from impactopt.errors import InputError
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.terms.base import Term, of_joints
+from impactopt.problem.violation import Measure
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointJerk(Term):
+    """|joint jerk| is bounded in swing, follow-through and abort motion.
+
+    The jerk of a joint is constant in each interval of a spline. The joints of legs that fixed soles
+    determine have no bound. Position and velocity of the servo's reference jump as contact ends. If the limit
+    is given by joint, other joints have no bound.
+    """
+
+    name: ClassVar[str] = "joint jerk"
+    unit: ClassVar[str] = "of limit"
+    whole_motion: ClassVar[bool] = True
+    limit: float | Mapping[str, float] = field(
+        metadata=about("largest jerk, of all or by joint", unit="rad/s^3", above=0, by_joint=True)
+    )
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        for k in coordinates.dependent:
+            if (joint := coordinates.robot.joint_names[k]) in self.joints:
+                raise InputError(
+                    f"JointJerk.limit: {joint!r} is determined by the other joints and a fixed sole; "
+                    "leave it out"
+                )
+        return {"joint_jerk": BlockRecipe(lambda: joint_jerk(coordinates))}
+
+    def add_constraints(self, program: Any) -> None:
+        names = [program.robot.joint_names[k] for k in program.coordinates.independent]
+        limit, spots = of_joints(self.limit, names), program.third_derivatives()
+        at = program.add_block("joint_jerk", [slots for _, slots in spots], np.zeros(0))
+        for k, (place, _) in enumerate(spots):
+            program.constraints.add(
+                term=self.name,
+                place=place,
+                components=names,
+                outputs=at + len(names) * k + np.arange(len(names)),
+                lower=-limit / TYPICAL,
+                upper=limit / TYPICAL,
+                measure=[Measure("%", 100 * TYPICAL / most, "over its limit") for most in limit],
+            )
+
+
+TYPICAL = 1e3  # [rad/s^3] of a strike, by which the constraints are scaled
+
+
+def joint_jerk(c: StanceCoordinates) -> BlockExpression:
+    """Jerks of the independent joints.
+
+    z = y''' (ny), T [s], with the jerk y'''/T^3;  out = jerks over 1000 rad/s^3 (ny less the base's).
+    """
+    third, T = ca.SX.sym("third", c.ny), ca.SX.sym("T")
+    return make_block([third, T], [], {"jerk": third[c.base :] / T**3 / TYPICAL})

@@ -72,11 +72,13 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
         contact = abs(track.time[k] - track.contact_start) < 1e-6
         axes[0, column].set_title(f"{'contact, ' if contact else ''}{track.time[k]:.2f} s")
     figure.suptitle(title(record, "planned motion"))
+    leaves = np.abs(track.travel[chosen]).max() >= MAX_TRAVEL
+    until = f", until it has moved by {MAX_TRAVEL:g} m" if leaves else ""
     figure.legend(
         handles=[
             Patch(color=BLUE, label="limb that strikes"),
             Line2D([], [], color=VERMILION, marker="o", markersize=3, linestyle="", label="hit point"),
-            Patch(color=ORANGE, label=f"target, until it has moved by {MAX_TRAVEL:g} m"),
+            Patch(color=ORANGE, label=f"target{until}"),
         ],
         loc="outside lower center",
         ncols=3,

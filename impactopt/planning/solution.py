@@ -16,7 +16,13 @@ from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import counted
 from impactopt.planning.bounds import Cause
-from impactopt.planning.contact_replay import SOLVED_WITHIN, ContactReplay, ModelError, PlannedContact
+from impactopt.planning.contact_replay import (
+    ACCEPTABLE_WITHIN,
+    SOLVED_WITHIN,
+    ContactReplay,
+    ModelError,
+    PlannedContact,
+)
 from impactopt.planning.gain_selection import ChosenGains
 from impactopt.planning.lazy_constraints import (
     gear_caution,
@@ -93,9 +99,18 @@ class Solved:
 
     @property
     def caution(self) -> str:
-        """Warning about effects that the planned contact leaves out; empty if the replay agrees with it."""
-        replay = self.contact_replay
-        return str(replay) if replay is not None and (replay.unforeseen or replay.off > SOLVED_WITHIN) else ""
+        """Warning about effects that the planned contact leaves out, or a large error of its collision model;
+        empty if the replay agrees with it.
+        """
+        replay, error = self.contact_replay, self.model_error
+        if replay is not None and (replay.unforeseen or replay.off > SOLVED_WITHIN):
+            return str(replay)
+        if error is not None and abs(error.impulse_pct) > ACCEPTABLE_WITHIN:
+            return (
+                f"The impulse by the collision model {self.problem.collision!r} is off by "
+                f'{error.impulse_pct:+.2g} % against full dynamics: plan with collision.model = "full".'
+            )
+        return ""
 
     @property
     def status(self) -> Status:

@@ -311,6 +311,26 @@ def test_one_word_list() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("model", ["sdc", "full"])
+def test_a_model_that_is_far_off_is_told(model: str) -> None:
+    """In a shove of a quarter of a second the arm moves far from where the model is frozen."""
+    problem = load_problem("arm7")
+    soft, long = SpringDamper(stiffness=300.0, damping=5.0), (0.0, 0.3)
+    found = solve(
+        dataclasses.replace(
+            problem, law=soft, target=FreeMass(mass=2.0), collision=model, contact_duration=long
+        )
+    )
+    assert found.status is Status.SOLVED
+    simulated = found.validate().impulse
+    off = 100 * (found.impulse / simulated - 1)
+    assert (abs(off) > 5) == (model == "sdc")
+    told = f"{model!r} is off by {off:+.2g} % against full dynamics" if model == "sdc" else ""
+    assert told in found.summary().get("caution", "")
+    assert bool(found.caution) == (model == "sdc")
+
+
+@pytest.mark.slow
 def test_a_file_says_it_and_a_result_too() -> None:
     runner, extra = CliRunner(), ["--json", "-q", "--starts", "1"]
     given = ["--set", 'collision.model="sdc"', "--set", "collision.freezes=2"]

@@ -1,15 +1,24 @@
 """Terms: constraints of a plan with a name and a unit. A problem has at most one of each kind.
 
-`base` has the interface of a term, and each other file one term. DEFAULT_TERMS hold in every problem; the
-transcription adds the constraints of most of them, and all other terms add their own. ON_DEMAND_TERMS hold in
+`base` has the interface of a term, `default_limits` the terms whose constraints the transcription adds, and
+each other file one term, which adds its own. DEFAULT_TERMS hold in every problem. ON_DEMAND_TERMS hold in
 every problem, too, but a program has their constraints only if the term is given, or once a plan has violated
 it (`impactopt.planning.lazy_constraints`). All other terms hold only if they are given. A new term is a file
 here, and is listed below.
 """
 
-from impactopt.problem.terms.balance import Balance
 from impactopt.problem.terms.base import Term, check_known, kind_of
-from impactopt.problem.terms.contact_wrench_cone import ContactWrenchCone
+from impactopt.problem.terms.default_limits import (
+    Balance,
+    ContactWrenchCone,
+    Incidence,
+    KeepOut,
+    LegExtension,
+    PositionLimit,
+    SelfCollision,
+    TorqueLimit,
+    VelocityLimit,
+)
 from impactopt.problem.terms.first_touch import FirstTouch
 from impactopt.problem.terms.gaze import Gaze
 from impactopt.problem.terms.gear_load import GearLoad
@@ -18,21 +27,14 @@ from impactopt.problem.terms.ground_force import GroundForce
 from impactopt.problem.terms.hand_orientation import HandOrientation
 from impactopt.problem.terms.hit_cone import HitCone
 from impactopt.problem.terms.hit_region import HitRegion
-from impactopt.problem.terms.incidence import Incidence
 from impactopt.problem.terms.joint_acceleration import JointAcceleration
-from impactopt.problem.terms.keep_out import KeepOut
-from impactopt.problem.terms.leg_extension import LegExtension
 from impactopt.problem.terms.motor_curve import MotorCurve
-from impactopt.problem.terms.position_limit import PositionLimit
 from impactopt.problem.terms.power_limit import PowerLimit
 from impactopt.problem.terms.reference_range import ReferenceRange
-from impactopt.problem.terms.self_collision import SelfCollision
 from impactopt.problem.terms.slide import Slide
 from impactopt.problem.terms.target_speed import TargetSpeed
-from impactopt.problem.terms.torque_limit import TorqueLimit
 from impactopt.problem.terms.torque_rate import TorqueRate
 from impactopt.problem.terms.velocity_jump import VelocityJump
-from impactopt.problem.terms.velocity_limit import VelocityLimit
 
 DEFAULT_TERMS: tuple[Term, ...] = (
     TorqueLimit(),

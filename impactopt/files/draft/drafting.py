@@ -30,7 +30,8 @@ from impactopt.files.draft.strong import FOLLOW, ITERATIONS, SECONDS, SWING, Str
 from impactopt.files.draft.target_placement import STRIKE_DIRECTIONS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
-from impactopt.files.problem_file.writing import sole_data, striker_data, tool_data
+from impactopt.files.problem_file.writing import ROBOT_KEYS, section_data, sole_data
+from impactopt.files.sections.robot import StrikerSection, ToolSection
 from impactopt.files.toml import Place, plain_value, write_toml
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
@@ -492,19 +493,13 @@ def _data(
     keys["name"] = robot.name
     if "floating" in options:
         keys["floating"] = options["floating"]
-    for option, key in (
-        ("locked", "locked_rad"),
-        ("armature", "armature_kg_m2"),
-        ("torque_limit", "torque_limit_N_m"),
-        ("velocity_limit", "velocity_limit_rad_s"),
-        ("position_limit", "position_limit_rad"),
-    ):
+    for option in ("locked", "armature", "torque_limit", "velocity_limit", "position_limit"):
         if options.get(option):
-            keys[key] = dict(options[option])
+            keys[ROBOT_KEYS[option]] = dict(options[option])
     if soles:
         keys["soles"] = [sole_data(sole) for sole in soles]
-    keys["strikers"] = [striker_data(striker) for striker in strikers]
-    keys |= {"tools": [tool_data(tool) for tool in robot.tools]} if robot.tools else {}
+    keys["strikers"] = [section_data(StrikerSection, striker) for striker in strikers]
+    keys |= {"tools": [section_data(ToolSection, tool) for tool in robot.tools]} if robot.tools else {}
     angles = zip(robot.joint_names, robot.joint_positions(q), robot.hinges, strict=True)
     keys["postures_rad"] = {START: {joint: round(float(x), 5) for joint, x, hinge in angles if not hinge}}
     mass = sum(float(body.mass) for body in robot.model.inertias)

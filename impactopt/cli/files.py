@@ -204,16 +204,12 @@ def _check_free(out: Path | None) -> None:
 
 def _give(text: str, out: Path | None, as_json: bool = False) -> None:
     """Prints a file's text, or writes it to a new file; as JSON also its data."""
-    from impactopt.codegen.files import write_atomically
-    from impactopt.errors import InputError
+    from impactopt.files.output import write_file
     from impactopt.files.toml import read_toml
 
     if out is not None:
         _check_free(out)
-        try:
-            write_atomically(out, lambda file: file.write(text.encode()))
-        except OSError as error:
-            raise InputError(f"cannot write {out}: {error.strerror}") from error
+        write_file(out, lambda file: file.write(text.encode()))
     if as_json:
         path = None if out is None else str(out)
         print_json({"file": path, "toml": text, "data": read_toml(text)}, True)

@@ -67,7 +67,7 @@ class CollisionFile:
         InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
         """
         path = problem_file(path)
-        return cls.parse(_read(path), path, settings)
+        return cls.parse(read_text(path), path, settings)
 
     @classmethod
     def parse(cls: type[_F], text: str, path: Path, settings: Mapping[str, Any] | None = None) -> _F:
@@ -249,7 +249,8 @@ def _robot_given_once(data: Mapping[str, Any]) -> list[Mistake]:
     return [Mistake(place=("problem", "robot"), sections=1, text=text)]
 
 
-def _read(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """Text of a TOML file; InputError if there is none, or it cannot be read."""
     try:
         return read_plain(path, LONGEST_TEXT).decode("utf-8-sig")
     except FileNotFoundError as error:

@@ -54,6 +54,7 @@ from impactopt.problem.checks import (
     check_motors,
     check_moves,
     check_names,
+    check_parts,
     check_prices,
     check_stance,
     check_strikers,
@@ -251,10 +252,7 @@ class ImpactProblem:
         object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
 
     def _check_scenarios(self) -> None:
-        listed = isinstance(self.scenarios, (list, tuple))
-        if not listed or not all(isinstance(s, Scenario) for s in self.scenarios):
-            raise InputError(f"scenarios must be a tuple of Scenario, not {self.scenarios!r}")
-        object.__setattr__(self, "scenarios", tuple(self.scenarios))
+        check_parts(self, "scenarios", Scenario)
         if self.scenarios and not self.lasts:
             raise InputError(f'scenarios need a contact that lasts, as "full", not {self.collision!r}')
         check_apart("scenario", [s.name for s in self.scenarios])

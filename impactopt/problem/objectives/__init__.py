@@ -1,15 +1,13 @@
 """Objectives of a plan: quantities whose weighted sum is maximized; the impulse by default.
 
-`base` has the interface of an objective, and each other file one objective. A new one is a file here, and is
-listed below.
+`base` has the interface of an objective, `plain` those without blocks of their own, and each other file one
+objective. A new one is a file here, and is listed below.
 """
 
-from impactopt.problem.objectives.angular_momentum import AngularMomentum
 from impactopt.problem.objectives.base import Objective, check_objectives
 from impactopt.problem.objectives.effort import Effort
-from impactopt.problem.objectives.impulse import Impulse
 from impactopt.problem.objectives.peak_force import PeakForce
-from impactopt.problem.objectives.penetration import Penetration
+from impactopt.problem.objectives.plain import AngularMomentum, Impulse, Penetration
 from impactopt.problem.objectives.target_energy import TargetEnergy
 
 DEFAULT_OBJECTIVES: tuple[Objective, ...] = (Impulse(),)

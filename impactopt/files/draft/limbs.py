@@ -62,7 +62,7 @@ def limbs_of(model: pin.Model) -> tuple[Limb, ...]:
     return tuple(out)
 
 
-def _range(model: pin.Model, j: int) -> tuple[float, float]:
+def range_of(model: pin.Model, j: int) -> tuple[float, float]:
     """Range [rad], [m] of a joint; infinite of those that have none, such as continuous ones."""
     k = model.joints[j].idx_q
     if model.joints[j].nq != 1:
@@ -81,7 +81,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
     effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
     weight = np.abs(pin.computeGeneralizedGravity(model, model.createData(), neutral(model)))
     for j in range(model.njoints - 1, first - 1, -1):
-        joint, name, (low, high) = model.joints[j], str(model.names[j]), _range(model, j)
+        joint, name, (low, high) = model.joints[j], str(model.names[j]), range_of(model, j)
         if low > high:
             continue  # crossed limits are a mistake of the file, which the robot's checks report
         if not low < high:
@@ -97,7 +97,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
         elif "JointModelP" in joint.shortname() and high - low > TRAVEL:
             # what turns such a slide, or turns on it without a limit, steers the base
             steering = [i for i in model.supports[j] if i >= first]
-            steering += [i for i in children[j] if np.ptp(_range(model, i)) > TURN]
+            steering += [i for i in children[j] if np.ptp(range_of(model, i)) > TURN]
             out |= {str(model.names[i]): "drives a base" for i in steering}
     for j in range(first, model.njoints):  # a hand: several short and light chains on one link
         small = [c for c in children[j] if mass[c] < FINGER_MASS * total and reach[c] < FINGER_LENGTH]

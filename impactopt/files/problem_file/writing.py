@@ -93,13 +93,13 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
     options = {name: value for name, value in source.options.items() if value is not None}
     data: dict[str, Any] = {} if source.preset is None else {"preset": source.preset}
     if source.urdf is not None:
-        data["urdf"] = _relative(source.urdf, folder)
+        data["urdf"] = relative_path(source.urdf, folder)
     if source.mjcf is not None:
-        data["mjcf"] = _relative(source.mjcf, folder)
+        data["mjcf"] = relative_path(source.mjcf, folder)
     if options.get("inertias", GIVEN) != GIVEN:
         data["inertias"] = options["inertias"]
     if "srdf" in options:
-        data["srdf"] = _relative(options["srdf"], folder)
+        data["srdf"] = relative_path(options["srdf"], folder)
     if "name" in options:
         data["name"] = options["name"]
     if "floating" in options and (source.mjcf is not None or not options["floating"]):
@@ -172,7 +172,7 @@ def _actuators(robot: Robot) -> list[dict[str, Any]]:
     ]
 
 
-def _relative(path: Any, folder: Path) -> str:
+def relative_path(path: Any, folder: Path) -> str:
     """A path relative to the folder if it is in or below it, else the absolute path."""
     absolute, base = Path(path).expanduser().resolve(), folder.resolve()
     return str(absolute.relative_to(base) if absolute.is_relative_to(base) else absolute)

@@ -6,13 +6,13 @@ before anything is drawn or computed from it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import has_control
+from impactopt.files.toml import check_plain, text_with_control
 
 # Shapes of arrays. Letters are sizes: n, nq and nv are the robot's, the same in all arrays; others are the
 # same in all arrays of one prefix. "?" at the beginning: the array may be missing, as in records of older
@@ -204,7 +204,6 @@ _OTHERS: Mapping[str, _Kinds] = {
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
     **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "style?", "collision_model?"), _TEXT),
 }
-_MAX_DEPTH = 20  # of tables and lists in a summary
 
 
 def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -275,9 +274,9 @@ def check_summary(summary: Any, *, whole: bool) -> None:
         raise ValueError("its summary is no table")
     needed = _KEYS if whole else {f"{name}?": kinds for name, kinds in _KEYS.items()}
     _check_table("", summary, {**needed, **_OTHERS})
-    for text in _texts(summary):
-        if has_control(text):
-            raise ValueError(f"its summary has text with control characters: {text[:40]!r}")
+    check_plain(summary)
+    if text := text_with_control(summary):
+        raise ValueError(f"its summary has text with control characters: {text[:40]!r}")
 
 
 def _check_kind(name: str, value: Any, kinds: _Kinds) -> None:
@@ -311,18 +310,3 @@ def _check_table(above: str, table: Mapping[str, Any], kinds: Mapping[str, _Kind
     if "*" in kinds:
         for name, value in table.items():
             _check_kind(f"{above}{name}", value, kinds["*"])
-
-
-def _texts(data: Any, depth: int = 0) -> Iterator[str]:
-    """All texts and keys in a summary."""
-    if depth > _MAX_DEPTH:
-        raise ValueError(f"its summary is nested deeper than {_MAX_DEPTH}")
-    if isinstance(data, str):
-        yield data
-    elif isinstance(data, dict):
-        for key, value in data.items():
-            yield key
-            yield from _texts(value, depth + 1)
-    elif isinstance(data, list):
-        for value in data:
-            yield from _texts(value, depth + 1)

@@ -76,10 +76,12 @@ def to_lock(model: pin.Model) -> dict[str, str]:
     """
     children, out = _children(model), dict[str, str]()
     first = 2 if is_floating(model) else 1
-    mass, total = _moved_mass(model, children), sum(float(body.mass) for body in model.inertias)
+    data = model.createData()
+    pin.computeSubtreeMasses(model, data)
+    mass, total = list(data.mass), float(data.mass[0])
     reach = _reach(model, children)
     effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
-    weight = np.abs(pin.computeGeneralizedGravity(model, model.createData(), neutral(model)))
+    weight = np.abs(pin.computeGeneralizedGravity(model, data, neutral(model)))
     for j in range(model.njoints - 1, first - 1, -1):
         joint, name, (low, high) = model.joints[j], str(model.names[j]), range_of(model, j)
         if low > high:
@@ -206,13 +208,6 @@ def _children(model: pin.Model) -> dict[int, list[int]]:
 
 def _subtree(joint: int, children: Mapping[int, list[int]]) -> list[int]:
     return [joint, *(i for c in children[joint] for i in _subtree(c, children))]
-
-
-def _moved_mass(model: pin.Model, children: Mapping[int, list[int]]) -> dict[int, float]:
-    """Mass [kg] that each joint moves."""
-    return {
-        j: sum(float(model.inertias[i].mass) for i in _subtree(j, children)) for j in range(model.njoints)
-    }
 
 
 def _reach(model: pin.Model, children: Mapping[int, list[int]]) -> dict[int, float]:

@@ -58,7 +58,7 @@ _PUBLIC = {
 }
 _EXPORTS = {name: module for module, names in _PUBLIC.items() for name in names}
 
-# families of one class a file: the classes that their packages list
+# families of one class a file: the classes in their packages
 _FAMILIES = ("contact.laws", "contact.targets", "problem.objectives", "problem.terms")
 
 
@@ -67,7 +67,7 @@ def _all_exports() -> dict[str, str]:
     found = dict(_EXPORTS)
     for module in _FAMILIES:
         family = importlib.import_module(f"impactopt.{module}")
-        found |= {name: module for name in family.__all__ if isinstance(getattr(family, name), type)}
+        found |= {name: module for name, thing in vars(family).items() if isinstance(thing, type)}
     return found
 
 

@@ -63,7 +63,8 @@ from impactopt.problem.checks import (
 )
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
-from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
+from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective
+from impactopt.problem.objectives.base import check_objectives
 from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
 from impactopt.problem.stances import (
     StancePhase,
@@ -83,9 +84,8 @@ from impactopt.problem.terms import (
     KeepOut,
     SelfCollision,
     Term,
-    check_known,
-    kind_of,
 )
+from impactopt.problem.terms.base import check_known, kind_of
 from impactopt.robots.attachments import Sole
 from impactopt.robots.gains import GainFactor
 from impactopt.robots.robot import Robot

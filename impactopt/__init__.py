@@ -58,7 +58,7 @@ _PUBLIC = {
 }
 _EXPORTS = {name: module for module, names in _PUBLIC.items() for name in names}
 
-# families of one class a file: the classes in their packages
+# families: the classes in their packages
 _FAMILIES = ("contact.laws", "contact.targets", "problem.objectives", "problem.terms")
 
 

@@ -22,15 +22,9 @@ Array = NDArray[np.float64]
 Given = ParamSpec("Given")
 Drawn = TypeVar("Drawn")
 
-BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#CC79A7",
-    "#56B4E9",
-    "#000000",
-)
+# in the order in which lines get them
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
+BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK = COLOURS
 
 # of collision models, in all pictures
 MODELS = {
@@ -58,7 +52,7 @@ STYLE: Any = {
     "figure.constrained_layout.use": True,
     "font.size": 8,
     "axes.titlesize": 9,
-    "axes.prop_cycle": cycler(color=[BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK]),
+    "axes.prop_cycle": cycler(color=COLOURS),
     "figure.titlesize": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,

@@ -28,14 +28,7 @@ from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.contact.targets.base import TOUCH, ContactPhase, contact_phases, order_of_touches
-from impactopt.errors import (
-    FARTHEST,
-    InputError,
-    Mistakes,
-    check_array,
-    check_kind,
-    check_name,
-)
+from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, check_kind, check_name
 from impactopt.kinematics.coordinates import MAX_START_PITCH, StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance
@@ -47,13 +40,7 @@ from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective
 from impactopt.problem.objectives.base import check_objectives
 from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
-from impactopt.problem.stances import (
-    StancePhase,
-    check_stances,
-    impact_phase,
-    names_of,
-    phase_coordinates,
-)
+from impactopt.problem.stances import StancePhase, check_stances, impact_phase, names_of, phase_coordinates
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,

@@ -13,13 +13,7 @@ from pydantic.fields import FieldInfo
 from impactopt.errors import FARTHEST, MANY, MOST
 from impactopt.files.named_problems import problem_file, problem_summary
 from impactopt.files.problem_file.reading import read_problem_file
-from impactopt.files.problem_file.sections import (
-    File,
-    TermSections,
-    about_section,
-    comment_at,
-    defaults_of,
-)
+from impactopt.files.problem_file.sections import File, TermSections, about_section, comment_at, defaults_of
 from impactopt.files.sections.collision import LAWS, TARGETS, with_kinds
 from impactopt.files.sections.diagnostics import range_of, section_at
 from impactopt.files.sections.reading import LONGEST_KEY

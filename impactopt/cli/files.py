@@ -29,29 +29,21 @@ def check(
     with plain_errors("interrupted", verbose=verbose, as_json=as_json):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.feasibility import (
-            blocked,
-            hopeless,
-            overlapping,
-            sticks_out,
-            too_weak,
-            unusual,
-            without_effect,
-        )
+        from impactopt.problem import feasibility
         from impactopt.problem.plausibility import doubts
 
         try:
             problem = read_problem_file(file, parse_settings(settings or ()), names=True).build()
             found = Mistakes()
-            found.found += hopeless(problem)
+            found.found += feasibility.hopeless(problem)
             found.raise_if_any(str(file))
             told = (
-                *blocked(problem),
-                too_weak(problem),
-                overlapping(problem),
-                *unusual(problem),
-                *without_effect(problem),
-                *sticks_out(problem),
+                *feasibility.blocked(problem),
+                feasibility.too_weak(problem),
+                feasibility.overlapping(problem),
+                *feasibility.unusual(problem),
+                *feasibility.without_effect(problem),
+                *feasibility.sticks_out(problem),
                 *doubts(problem.robot),
             )
             warnings = [text for text in told if text]

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import numpy as np
 
@@ -15,31 +15,8 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_kind
 from impactopt.files.problem_file.reading import problem_file_from_data
-from impactopt.files.problem_file.sections import (
-    ELEMENTS,
-    File,
-    FollowSection,
-    GroundSection,
-    ObjectiveSection,
-    ObjectiveSections,
-    ObstacleSection,
-    ScenarioSection,
-    SecondSection,
-    SolverSettings,
-    SwingSection,
-    TermSections,
-    comment_at,
-    defaults_of,
-)
-from impactopt.files.sections.collision import (
-    LAWS,
-    TARGETS,
-    Body,
-    CollisionSection,
-    FrictionSection,
-    ProblemSection,
-    StancePhaseSection,
-)
+from impactopt.files.problem_file.sections import ELEMENTS, File, SolverSettings, comment_at, defaults_of
+from impactopt.files.sections.collision import LAWS, TARGETS, Body, ProblemSection
 from impactopt.files.sections.robot import (
     ActuatorSection,
     GripSection,
@@ -247,7 +224,7 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     hands = {"hands": [hand.name for hand in fixed_hands]} if fixed_hands else {}
     data["stances"] = [
         {"soles": list(each.soles)}
-        | ({} if each.phase is None else section_data(StancePhaseSection, each.phase, ("soles", "steps")))
+        | ({} if each.phase is None else _section("stances", each.phase, ("soles", "steps")))
         | ({"steps_m": {name: list(step) for name, step in each.steps.items()}} if each.steps else {})
         for each in problem.stances
     ]
@@ -256,32 +233,40 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     if (isinstance(stance, OneSole) and not problem.stances) or hands:
         data["stance"] = ({"soles": stance.name} if isinstance(stance, OneSole) else {}) | hands
     if problem.second is not None:
-        data["second"] = section_data(SecondSection, problem.second)
-    for name, section, phase in (
-        ("swing", SwingSection, problem.swing),
-        ("follow", FollowSection, problem.follow),
-    ):
+        data["second"] = _section("second", problem.second)
+    for name, phase in (("swing", problem.swing), ("follow", problem.follow)):
         if phase != factories[name]():
-            data[name] = section_data(section, phase)
+            data[name] = _section(name, phase)
     elements = dict(zip(ELEMENTS, problem.collision_elements, strict=True))
-    for name, part in (("collision", CollisionSection), ("objective", ObjectiveSection)):
+    for name in ("collision", "objective"):
+        part = _kind(name)
         values = {key: elements.get(key, getattr(problem, key, None)) for key in part.model_fields}
         data[name] = _different(part, values)
-    data["scenarios"] = [section_data(ScenarioSection, scenario) for scenario in problem.scenarios]
+    data["scenarios"] = [_section("scenarios", scenario) for scenario in problem.scenarios]
     if problem.objectives != ImpactProblem.objectives:
-        data["objectives"] = _parts(ObjectiveSections, problem.objectives)
-    data["terms"] = _parts(TermSections, [term for term in problem.terms if term not in DEFAULT_TERMS])
+        data["objectives"] = _parts(_kind("objectives"), problem.objectives)
+    data["terms"] = _parts(_kind("terms"), [term for term in problem.terms if term not in DEFAULT_TERMS])
     if problem.body != TargetBody():
         data["target"]["body"] = section_data(Body, problem.body)
-    data["obstacles"] = [section_data(ObstacleSection, obstacle) for obstacle in problem.obstacles]
+    data["obstacles"] = [_section("obstacles", obstacle) for obstacle in problem.obstacles]
     if problem.friction is not None:
-        data["friction"] = {"coefficient": problem.friction.coefficient} | section_data(
-            FrictionSection, problem.friction
-        )
+        friction = _section("friction", problem.friction)
+        data["friction"] = {"coefficient": problem.friction.coefficient} | friction
     if problem.ground is not None:
-        data["ground"] = {"height_m": 0.0} | section_data(GroundSection, problem.ground)
+        data["ground"] = {"height_m": 0.0} | _section("ground", problem.ground)
     order = ["problem", *(name for name in File.model_fields if name != "problem")]
     return {name: data[name] for name in order if data.get(name)}
+
+
+def _kind(name: str) -> Any:
+    """The class of a file's section, or of the entries of a list of them, by its name."""
+    kind: Any = File.model_fields[name].annotation
+    return get_args(kind)[0] if get_origin(kind) is list else kind
+
+
+def _section(name: str, thing: Any, without: Sequence[str] = ()) -> dict[str, Any]:
+    """`section_data` of a file's section, by its name."""
+    return section_data(_kind(name), thing, without)
 
 
 def _parts(section: type[Section], things: Any) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from impactopt.files.named_problems import problem_file, problem_summary
 from impactopt.files.problem_file.reading import read_problem_file
 from impactopt.files.problem_file.sections import File, TermSections, about_section, comment_at, defaults_of
 from impactopt.files.sections.collision import LAWS, TARGETS, with_kinds
-from impactopt.files.sections.diagnostics import range_of, section_at
+from impactopt.files.sections.diagnostics import range_of, section_at, section_in
 from impactopt.files.sections.reading import LONGEST_KEY
 from impactopt.files.sections.values import Section
 from impactopt.files.toml import DEEPEST, LONGEST_TEXT, Place, plain_value, write_toml
@@ -78,11 +78,9 @@ def _left_out(data: dict[str, Any]) -> list[str]:
     ]
     lines = ["# There may be more sections; `impactopt new --reference` says what is in them:"]
     for name, info in found:
-        kind: Any = info.annotation
-        many = not isinstance(kind, type)
-        section = kind.__args__[0] if many else kind
+        header = f"[[{name}]]" if get_origin(info.annotation) is list else f"[{name}]"
         if name != "robot":
-            lines.append(f"#   {f'[[{name}]]' if many else f'[{name}]'}  {about_section(section)}")
+            lines.append(f"#   {header}  {about_section(section_in(info.annotation))}")
     return lines
 
 
@@ -156,21 +154,13 @@ def reference() -> str:
 
 def _sections(place: str, info: FieldInfo) -> Iterator[tuple[str, type[BaseModel]]]:
     """A section and its subsections, with their headers."""
-    section, many = _inner(info)
+    section, form = section_in(info.annotation), get_origin(info.annotation)
     if section is None:
         return
-    place = f"{place}.NAME" if get_origin(info.annotation) is dict else place
-    yield (f"[[{place}]]" if many else f"[{place}]"), section
+    place = f"{place}.NAME" if form is dict else place
+    yield (f"[[{place}]]" if form is list else f"[{place}]"), section
     for name, inner in section.model_fields.items():
         yield from _sections(f"{place}.{name}", inner)
-
-
-def _inner(info: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
-    """The section in a field, None if it has none; and True if it has a list of them."""
-    many = get_origin(info.annotation) is list
-    named = get_origin(info.annotation) is dict
-    kind = get_args(info.annotation)[-1] if many or named else info.annotation
-    return (kind, many) if isinstance(kind, type) and issubclass(kind, BaseModel) else (None, many)
 
 
 def _part(header: str, section: type[BaseModel], seen: dict[tuple[str, ...], str], note: str = "") -> str:
@@ -203,7 +193,7 @@ def _keys(section: type[BaseModel]) -> Iterator[str]:
     """A line for each key of the section itself."""
     defaults = defaults_of(section) if issubclass(section, Section) else {}
     for name, info in section.model_fields.items():
-        if _inner(info)[0] is not None or name == getattr(section, "choice", ""):
+        if section_in(info.annotation) is not None or name == getattr(section, "choice", ""):
             continue  # a subsection, or in the header
         if info.is_required():
             default = "**needed**"

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from impactopt.errors import InputError, check_kind
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import ELEMENTS, File, SolverSettings, comment_at, defaults_of
 from impactopt.files.sections.collision import LAWS, TARGETS, Body, ProblemSection
+from impactopt.files.sections.diagnostics import section_in
 from impactopt.files.sections.robot import (
     ActuatorSection,
     GripSection,
@@ -259,9 +260,8 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
 
 
 def _kind(name: str) -> Any:
-    """The class of a file's section, or of the entries of a list of them, by its name."""
-    kind: Any = File.model_fields[name].annotation
-    return get_args(kind)[0] if get_origin(kind) is list else kind
+    """The class of a file's section, by its name."""
+    return section_in(File.model_fields[name].annotation)
 
 
 def _section(name: str, thing: Any, without: Sequence[str] = ()) -> dict[str, Any]:

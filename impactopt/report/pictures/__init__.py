@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from impactopt.errors import InputError, check_choice, check_kind
-from impactopt.files.output import record_of, write_file
+from impactopt.files.output import record_of, remove_file, write_file
 from impactopt.files.record import Record
 from impactopt.planning.solution import Solution
 from impactopt.report.pictures.ellipsoid import ellipsoid as ellipsoid
@@ -115,7 +115,7 @@ def save_pictures(record: Record, directory: Path, names: Iterable[str] = tuple(
         path = directory / f"{name}.png"
         picture = PICTURES[name](record) if record.completed else None
         if picture is None:
-            path.unlink(missing_ok=True)
+            remove_file(path)
             continue
         write_file(path, picture.write)
         written.append(path)

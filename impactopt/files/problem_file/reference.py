@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
@@ -129,7 +129,6 @@ _LIMITS = (
     ("`[collision] elements`", f"{MOST_ELEMENTS} a phase"),
     ("`[[scenarios]]`, and `[[obstacles]]`", f"{MANY} each"),
 )
-_SEVERAL = 4  # common first keys of two sections from which on they are listed once
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
 
@@ -137,18 +136,17 @@ def reference() -> str:
     """The page, in Markdown."""
     limits = "\n".join(f"* {what}: {most}" for what, most in _LIMITS)
     parts = [_INTRODUCTION.replace("{limits}", limits)]
-    seen: dict[tuple[str, ...], str] = {}
     several: dict[str, Mapping[str, type[Section]]] = {"target": TARGETS, "contact": LAWS}
     for name, info in File.model_fields.items():
         kinds = several.get(name, {})
         for kind, section in kinds.items():
             (choice,) = (i.alias or n for n, i in section.model_fields.items() if n == section.choice)
             note = ". The default" if kind == section.model_fields[section.choice].default else ""
-            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, seen, note))
+            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, note))
         below = _sections(name, info)
         if kinds:
             next(below)  # the section itself, whose keys are all listed by kind
-        parts += [_part(header, section, seen) for header, section in below]
+        parts += [_part(header, section) for header, section in below]
     return "\n".join(parts)
 
 
@@ -163,30 +161,10 @@ def _sections(place: str, info: FieldInfo) -> Iterator[tuple[str, type[BaseModel
         yield from _sections(f"{place}.{name}", inner)
 
 
-def _part(header: str, section: type[BaseModel], seen: dict[tuple[str, ...], str], note: str = "") -> str:
-    """Markdown of a section and its keys.
-
-    seen : headers of earlier sections by their keys, to refer to instead of listing the same keys again.
-    """
-    lines = [f"## `{header}`", "", f"{about_section(section)}{note}."]
-    keys = list(_keys(section))
-    known = max(seen, key=lambda other: _common(keys, other), default=())
-    same = _common(keys, known)
-    if same >= _SEVERAL or (same > 1 and same == len(keys) == len(known)):
-        last = "" if same == len(known) else f" up to {known[same - 1].split()[1]}"
-        lines[-1] += f" Keys: as in `{seen[known]}`{last}{', and' if same < len(keys) else '.'}"
-        keys = keys[same:]
-    elif keys:
-        seen[tuple(keys)] = header
-    lines += ["", *keys] if keys else []
-    return "\n".join([*lines, ""])
-
-
-def _common(keys: Sequence[str], others: Sequence[str]) -> int:
-    """Number of equal keys at the beginning of two sections."""
-    return next(
-        (k for k, (a, b) in enumerate(zip(keys, others, strict=False)) if a != b), min(len(keys), len(others))
-    )
+def _part(header: str, section: type[BaseModel], note: str = "") -> str:
+    """Markdown of a section and its keys."""
+    lines, keys = [f"## `{header}`", "", f"{about_section(section)}{note}."], list(_keys(section))
+    return "\n".join([*lines, *(["", *keys] if keys else []), ""])
 
 
 def _keys(section: type[BaseModel]) -> Iterator[str]:

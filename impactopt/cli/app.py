@@ -20,7 +20,7 @@ from impactopt.cli.export import export
 from impactopt.cli.files import check, new, problems, robots
 from impactopt.cli.identify import identify
 from impactopt.cli.options import (
-    NOT_SOLVED,
+    NO,
     AsJson,
     PlainCommand,
     PlainGroup,
@@ -156,7 +156,7 @@ def solve(
             if aside := set_aside(record.summary):
                 typer.echo(printable(aside))
         if not solution.status.usable:
-            raise typer.Exit(NOT_SOLVED)
+            raise typer.Exit(NO)
 
 
 # in the order of the help
@@ -218,15 +218,7 @@ def _show(record: Record, as_json: bool, ok: bool) -> None:
     if as_json:
         print_json(record.summary, ok)
         return
-    from impactopt.report.console import (
-        output,
-        reason_message,
-        result_table,
-        say,
-        say_details,
-        switched_off_message,
-        touches_message,
-    )
+    from impactopt.report.console import output, result_table, say, say_outcome
 
     console, summary = output(), record.summary
     if record.completed:
@@ -238,11 +230,7 @@ def _show(record: Record, as_json: bool, ok: bool) -> None:
             f"hardest minimum-jerk reach: {reach['impulse_Ns']:.2f} N s at "
             f"{reach['hand_speed_m_s']:.2f} m/s (simulated)",
         )
-    error = summary.get("simulated", {}).get("error")
-    beyond = summary.get("gear_caution")
-    cautions = (summary.get("caution"), touches_message(summary), beyond, switched_off_message(summary))
-    say(console, reason_message(summary), summary.get("note"), error, reach.get("error"), *cautions)
-    say_details(console, summary)
+    say_outcome(console, summary)
 
 
 if __name__ == "__main__":

@@ -9,10 +9,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import AsJson, Quiet, Settings, Verbose, complete_problem
+from impactopt.cli.options import NO, AsJson, Quiet, Settings, Verbose, complete_problem
 from impactopt.report.plain_errors import plain_errors, print_json
 
-NO_COLLISION = 1  # exit code
 RESULT_FREEZES = 16  # default for a saved result, as the contacts of plans are long
 Model = Literal["sdc", "sdc-paper", "virtual-mass", "rigid", "full"]
 
@@ -115,4 +114,4 @@ def collide(
                 if found["joints"]:
                     shown.print(torques_table(found["joints"]))
         if "reason" in found:
-            raise typer.Exit(NO_COLLISION)
+            raise typer.Exit(NO)

@@ -7,10 +7,8 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, ProblemPath, Quiet, Settings, Verbose, out_option
+from impactopt.cli.options import NO, AsJson, ProblemPath, Quiet, Settings, Verbose, out_option
 from impactopt.report.plain_errors import plain_errors, print_json
-
-NOT_IN = 1  # exit code
 
 
 def drive(
@@ -53,4 +51,4 @@ def drive(
             if aside := set_aside(done):
                 typer.echo(aside)
         if not series.done:
-            raise typer.Exit(NOT_IN)
+            raise typer.Exit(NO)

@@ -29,29 +29,21 @@ def check(
     with plain_errors("interrupted", verbose=verbose, as_json=as_json):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.feasibility import (
-            blocked,
-            hopeless,
-            overlapping,
-            sticks_out,
-            too_weak,
-            unusual,
-            without_effect,
-        )
+        from impactopt.problem import feasibility
         from impactopt.problem.plausibility import doubts
 
         try:
             problem = read_problem_file(file, parse_settings(settings or ()), names=True).build()
             found = Mistakes()
-            found.found += hopeless(problem)
+            found.found += feasibility.hopeless(problem)
             found.raise_if_any(str(file))
             told = (
-                *blocked(problem),
-                too_weak(problem),
-                overlapping(problem),
-                *unusual(problem),
-                *without_effect(problem),
-                *sticks_out(problem),
+                *feasibility.blocked(problem),
+                feasibility.too_weak(problem),
+                feasibility.overlapping(problem),
+                *feasibility.unusual(problem),
+                *feasibility.without_effect(problem),
+                *feasibility.sticks_out(problem),
                 *doubts(problem.robot),
             )
             warnings = [text for text in told if text]
@@ -204,16 +196,12 @@ def _check_free(out: Path | None) -> None:
 
 def _give(text: str, out: Path | None, as_json: bool = False) -> None:
     """Prints a file's text, or writes it to a new file; as JSON also its data."""
-    from impactopt.codegen.files import write_atomically
-    from impactopt.errors import InputError
+    from impactopt.files.output import write_file
     from impactopt.files.toml import read_toml
 
     if out is not None:
         _check_free(out)
-        try:
-            write_atomically(out, lambda file: file.write(text.encode()))
-        except OSError as error:
-            raise InputError(f"cannot write {out}: {error.strerror}") from error
+        write_file(out, lambda file: file.write(text.encode()))
     if as_json:
         path = None if out is None else str(out)
         print_json({"file": path, "toml": text, "data": read_toml(text)}, True)

@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from impactopt.errors import did_you_mean
 
-NOT_SOLVED = 1  # exit code
+NO = 1  # exit code of a command whose answer is no
 
 
 def complete_problem(incomplete: str) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from impactopt.cli.options import (
-    NOT_SOLVED,
+    NO,
     AsJson,
     ProblemPath,
     Quiet,
@@ -78,21 +78,13 @@ def strike(
         if as_json:
             print_json(record.summary, solution.status.usable)
         else:
-            from impactopt.report.console import (
-                output,
-                reason_message,
-                say,
-                say_details,
-                strike_table,
-                switched_off_message,
-            )
+            from impactopt.report.console import output, say, say_outcome, strike_table
 
             shown, s = output(), record.summary
             shown.print(strike_table(s))
-            say(shown, reason_message(s), s.get("gear_caution"), switched_off_message(s))
-            say_details(shown, s)
+            say_outcome(shown, s)
             say(shown, *written)
             if aside := set_aside(s):
                 typer.echo(printable(aside))
         if not solution.status.usable:
-            raise typer.Exit(NOT_SOLVED)
+            raise typer.Exit(NO)

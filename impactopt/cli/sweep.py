@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, complete_sweep, out_option
+from impactopt.cli.options import NO, AsJson, Quiet, complete_sweep, out_option
 from impactopt.report.plain_errors import plain_errors, print_json
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def sweep(
         else:
             _show(result)
         if result.failed == result.done:
-            raise typer.Exit(NOT_SOLVED)
+            raise typer.Exit(NO)
         if chosen.figure is not None:
             from impactopt.report.console import say
             from impactopt.report.pictures.sweep import save_sweep_picture

@@ -9,18 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import (
-    AsJson,
-    OtherProblem,
-    Quiet,
-    ResultPath,
-    Settings,
-    Verbose,
-    out_option,
-)
+from impactopt.cli.options import NO, AsJson, OtherProblem, Quiet, ResultPath, Settings, Verbose, out_option
 from impactopt.report.plain_errors import plain_errors, print_json
-
-FELL = 1  # exit code
 
 
 def validate(
@@ -154,4 +144,4 @@ def validate(
             caution = done.record.summary.get("gear_caution")
             say(console, replayed_touches_message(done.report), caution, touch_message(done.report), *written)
         if not ok:
-            raise typer.Exit(FELL)
+            raise typer.Exit(NO)

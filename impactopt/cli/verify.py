@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem, Quiet, ResultPath, Verbose
+from impactopt.cli.options import NO, AsJson, OtherProblem, Quiet, ResultPath, Verbose
 from impactopt.report.plain_errors import plain_errors, print_json
-
-NOT_OK = 1  # exit code
 
 
 def verify(
@@ -40,4 +38,4 @@ def verify(
             console.print(verdict_table(verdict.describe()))
             say(console, verdict.reason)
         if not verdict.ok:
-            raise typer.Exit(NOT_OK)
+            raise typer.Exit(NO)

@@ -176,9 +176,11 @@ def check_private_file(path: Path) -> None:
 def locked(path: Path, *, on_wait: Callable[[], None]) -> Iterator[None]:
     """Hold a lock on `path` between processes; `on_wait` is called if another one holds it.
 
+    The system releases it however the process ends.
+
     Raises
     ------
-    UnsafePath : it is no plain file, or cannot be made.
+    UnsafePath : it is no plain file, cannot be made, or is on a file system without locks.
     """
     import fcntl  # POSIX only, as compiling is
 
@@ -192,6 +194,8 @@ def locked(path: Path, *, on_wait: Callable[[], None]) -> Iterator[None]:
         except BlockingIOError:
             on_wait()
             fcntl.flock(handle, fcntl.LOCK_EX)
+        except OSError as error:
+            raise UnsafePath(f"{path} cannot be locked: {error.strerror}") from error
         yield
     finally:
         os.close(handle)

@@ -6,13 +6,13 @@ before anything is drawn or computed from it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import has_control
+from impactopt.files.toml import check_plain, text_with_control
 
 # Shapes of arrays. Letters are sizes: n, nq and nv are the robot's, the same in all arrays; others are the
 # same in all arrays of one prefix. "?" at the beginning: the array may be missing, as in records of older
@@ -58,58 +58,40 @@ _ROBOT = ("n", "nq", "nv")
 # arrays without NaN and infinity; in others NaN stands for a quantity that does not exist
 _FINITE = ("time", "q", "posture", "velocity", "angle", "torque", "links", "path")
 # Kinds of a value of the summary, of which one has to match: a type; a dict of keys and kinds for a table, in
-# which a key with "?" is optional and "*" is any other key; a list with one kind for a list.
+# which a key with "?" is optional and "*" is any key; a list with one kind for a list. A key that is not
+# named in its table is a number if it has one of these endings.
+_UNITS = ("_s", "_ms", "_m", "_mm", "_rad", "_rad_s3", "_N", "_Ns", "_J", "_W", "_pct", "_ratio", "_seconds")
 _Kinds = tuple[Any, ...]
 _TEXT: _Kinds = (str,)
 _NUMBER: _Kinds = (int, float, type(None))  # null for numbers that are not finite
 _YES: _Kinds = (bool, type(None))
 _NUMBERS: _Kinds = ({"*": _NUMBER},)
 _TOUCHES: _Kinds = (
-    [
-        {
-            **dict.fromkeys(("one", "other"), _TEXT),
-            "depth_mm": (int, float),
-            **dict.fromkeys(("start_s?", "end_s?", "force_N?"), _NUMBER),
-            "missed?": _YES,
-        }
-    ],
+    [{**dict.fromkeys(("one", "other"), _TEXT), "depth_mm": (int, float), "missed?": _YES}],
     type(None),
 )
 _CUT: dict[str, _Kinds] = {"joint": _TEXT, **dict.fromkeys(("ms", "most_Nm", "since_s"), _NUMBER)}
 _BLOW: dict[str, _Kinds] = {
-    **dict.fromkeys(("impulse_Ns?", "peak_force_N?", "contact_ms?", "hand_speed_m_s?"), _NUMBER),
     "target?": ({"*": (int, float, bool, type(None))}, type(None)),
+    "impulses_Ns?": ([_NUMBER], type(None)),  # of two strikers
 }
-_BODIES: dict[str, _Kinds] = {
-    "clearance_mm?": _NUMBER,
-    "nearest?": (str, type(None)),
-    "contacts_besides?": _TOUCHES,
-}
-_REPLAYS_NUMBERS = (
-    *("impulse_error_pct?", "step_error_pct?", "saturated_ms?", "final_posture_error_rad?"),
-    "beyond_range_rad?",
-    *("sole_slip_mm?", "sole_lift_mm?", "sole_lift_collision_mm?"),
-)
+_BODIES: dict[str, _Kinds] = {"nearest?": (str, type(None)), "contacts_besides?": _TOUCHES}
 _LOADS: dict[str, _Kinds] = {
-    **dict.fromkeys(("gear_ratio?", "motor_ratio?", "power_W?", "velocity_jump_rad_s?"), _NUMBER),
     **dict.fromkeys(
-        ("gear_joint?", "motor_joint?", "power_joint?", "velocity_jump_joint?"), (str, type(None))
+        ("gear_joint?", "motor_joint?", "power_joint?", "velocity_jump_joint?", "motor_cut_joint?"),
+        (str, type(None)),
     ),
-    "motor_cut_ms?": _NUMBER,
-    "motor_cut_joint?": (str, type(None)),
     "motor_cuts?": ([_CUT],),
 }
 _SOLES: dict[str, _Kinds] = {
     **dict.fromkeys(("sole_cop_margin_mm?", "sole_force_N?"), ({"*": _NUMBERS}, type(None))),
     "sole_cop_margin_asked_mm?": _NUMBERS,
-    "sole_force_asked_N?": _NUMBER,
     "landing_speed_m_s?": (*_NUMBERS, type(None)),
 }
 _ANY_REPLAY: dict[str, _Kinds] = {
     **_BLOW,
     **_BODIES,
     **_LOADS,
-    **dict.fromkeys(_REPLAYS_NUMBERS, _NUMBER),
     **dict.fromkeys(("engine?", "reason?", "error?"), _TEXT),
     "beyond_range?": (str, type(None)),
     "standing?": _YES,
@@ -118,7 +100,6 @@ _ANY_REPLAY: dict[str, _Kinds] = {
 _SIMULATED = {**_ANY_REPLAY, "torque_ratio?": _NUMBERS, "zmp_margin_m?": _NUMBERS}
 _REPLAYED = {
     **_ANY_REPLAY,
-    **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBER),
     **dict.fromkeys(("torque_ratio_by_phase?", "zmp_margin_by_phase_m?"), (*_NUMBERS, type(None))),
 }
 _START = {
@@ -142,7 +123,7 @@ _GAINS = {
     "at_bound": (bool,),
     **dict.fromkeys(("stiffness_N_m_rad", "damping_N_m_s_rad"), _NUMBERS),
 }
-_SCENARIO = {**_BLOW, "name": _TEXT, **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBER)}
+_SCENARIO = {**_BLOW, "name": _TEXT}
 # required keys of a record with arrays
 _KEYS: Mapping[str, _Kinds] = {
     **dict.fromkeys(("status", "message", "solver"), _TEXT),
@@ -159,26 +140,7 @@ _OTHERS: Mapping[str, _Kinds] = {
     **_LOADS,
     **dict.fromkeys(("objectives?", "posture_rad?", "velocity_rad_s?"), _NUMBERS),
     **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBERS),
-    **dict.fromkeys(
-        (
-            "duration_s?",
-            "collision_error_pct?",
-            "contact_replay_pct?",
-            "nodes_added?",
-            "motion_price_pct?",
-            "capture_margin_m?",
-            "slide_mm?",
-            "idle_travel_rad?",
-            "reversals?",
-            "peak_jerk_rad_s3?",
-            "work_J?",
-            "end_posture_rad?",
-            "first_touch_mm?",
-            "first_touch_ms?",
-        ),
-        _NUMBER,
-    ),
-    **dict.fromkeys(("freezes?", "price_scale?", "model_error_pct?", "model_error_zmp_mm?"), _NUMBER),
+    **dict.fromkeys(("nodes_added?", "reversals?", "freezes?", "price_scale?"), _NUMBER),
     "touches?": (int, [_TEXT]),  # a number in records of older versions
     "stances?": (
         [
@@ -204,7 +166,6 @@ _OTHERS: Mapping[str, _Kinds] = {
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
     **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "style?", "collision_model?"), _TEXT),
 }
-_MAX_DEPTH = 20  # of tables and lists in a summary
 
 
 def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -275,9 +236,9 @@ def check_summary(summary: Any, *, whole: bool) -> None:
         raise ValueError("its summary is no table")
     needed = _KEYS if whole else {f"{name}?": kinds for name, kinds in _KEYS.items()}
     _check_table("", summary, {**needed, **_OTHERS})
-    for text in _texts(summary):
-        if has_control(text):
-            raise ValueError(f"its summary has text with control characters: {text[:40]!r}")
+    check_plain(summary)
+    if text := text_with_control(summary):
+        raise ValueError(f"its summary has text with control characters: {text[:40]!r}")
 
 
 def _check_kind(name: str, value: Any, kinds: _Kinds) -> None:
@@ -301,28 +262,15 @@ def _check_kind(name: str, value: Any, kinds: _Kinds) -> None:
 
 
 def _check_table(above: str, table: Mapping[str, Any], kinds: Mapping[str, _Kinds]) -> None:
-    """ValueError for a table with a missing key or a wrong value; unknown keys, of newer versions, may be."""
+    """ValueError for a table with a missing key or a wrong value. Other keys, of newer versions, may be."""
     for key, inner in kinds.items():
         name = key.removesuffix("?")
         if name != "*" and name in table:
             _check_kind(f"{above}{name}", table[name], inner)
         elif name == key != "*":
             raise ValueError(f"its summary has no {above}{name}")
-    if "*" in kinds:
-        for name, value in table.items():
+    for name, value in table.items():
+        if "*" in kinds:
             _check_kind(f"{above}{name}", value, kinds["*"])
-
-
-def _texts(data: Any, depth: int = 0) -> Iterator[str]:
-    """All texts and keys in a summary."""
-    if depth > _MAX_DEPTH:
-        raise ValueError(f"its summary is nested deeper than {_MAX_DEPTH}")
-    if isinstance(data, str):
-        yield data
-    elif isinstance(data, dict):
-        for key, value in data.items():
-            yield key
-            yield from _texts(value, depth + 1)
-    elif isinstance(data, list):
-        for value in data:
-            yield from _texts(value, depth + 1)
+        elif name not in kinds and f"{name}?" not in kinds and name.endswith(_UNITS):
+            _check_kind(f"{above}{name}", value, _NUMBER)

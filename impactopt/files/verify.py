@@ -65,14 +65,8 @@ class Verdict:
 
     def describe(self) -> dict[str, Any]:
         """Content of `impactopt verify --json`."""
-        return {
-            "ok": self.ok,
-            "max_violation": self.max_violation,
-            "kkt": self.kkt,
-            "objective": self.objective,
-            "rows": {name: {"violation": by, "where": where} for name, (by, where) in self.rows.items()},
-            "reason": self.reason,
-        }
+        rows = {name: {"violation": by, "where": where} for name, (by, where) in self.rows.items()}
+        return {**vars(self), "rows": rows}
 
 
 def verify(result: str | os.PathLike[str], *, problem_file: str | os.PathLike[str] | None = None) -> Verdict:

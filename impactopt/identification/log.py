@@ -15,15 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import trapezoid
 
 from impactopt.codegen.files import read_archive
-from impactopt.errors import (
-    MOST,
-    InputError,
-    check_array,
-    check_direction,
-    counted,
-    did_you_mean,
-    shortened,
-)
+from impactopt.errors import MOST, InputError, check_array, check_direction, counted, did_you_mean, shortened
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.robots.robot import Robot
 

@@ -53,6 +53,14 @@ MOST_TOUCHES = 4
 MIN_MOBILITY = 1e-12
 
 
+def check_parts(problem: Any, name: str, kind: type) -> None:
+    """Makes a tuple of the parts of a problem with this name; InputError unless all are of a kind."""
+    given = getattr(problem, name)
+    if not isinstance(given, (list, tuple)) or not all(isinstance(part, kind) for part in given):
+        raise InputError(f"{name} must be a tuple of {kind.__name__}, not {given!r}")
+    object.__setattr__(problem, name, tuple(given))
+
+
 def check_apart(kind: str, names: Sequence[str]) -> None:
     """InputError if there are too many things of a kind, or two with the same name."""
     if len(names) > MANY:
@@ -85,11 +93,9 @@ def check_world(problem: Any) -> None:
     """InputError for wrong bodies of the world, and for a ground other than that of the soles."""
     if not isinstance(problem.body, TargetBody):
         raise InputError(f"body must be a TargetBody, not {problem.body!r}")
-    obstacles, ground = problem.obstacles, problem.ground
-    if not isinstance(obstacles, (list, tuple)) or not all(isinstance(o, Obstacle) for o in obstacles):
-        raise InputError(f"obstacles must be a tuple of Obstacle, not {obstacles!r}")
-    object.__setattr__(problem, "obstacles", tuple(obstacles))
-    check_apart("obstacle", [o.name for o in obstacles])
+    check_parts(problem, "obstacles", Obstacle)
+    check_apart("obstacle", [o.name for o in problem.obstacles])
+    ground = problem.ground
     if ground is not None and not isinstance(ground, Ground):
         raise InputError(f"ground must be a Ground, such as Ground(height=-0.8), not {ground!r}")
     if ground is not None and ground.height and problem.stands:
@@ -197,11 +203,7 @@ def check_gains(problem: Any) -> None:
     """InputError for gains that cannot be chosen: two factors for a joint, a servo that is too fast, or a
     contact without duration.
     """
-    if not isinstance(problem.gains, (list, tuple)) or not all(
-        isinstance(gain, GainFactor) for gain in problem.gains
-    ):
-        raise InputError(f"gains must be a tuple of GainFactor, not {problem.gains!r}")
-    object.__setattr__(problem, "gains", tuple(problem.gains))
+    check_parts(problem, "gains", GainFactor)
     if not problem.gains:
         return
     if problem.collision in INSTANT:

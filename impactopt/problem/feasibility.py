@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +17,7 @@ from impactopt.kinematics.inverse_kinematics import Reach, inverse_kinematics, r
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.plausibility import giant_soles
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import random_postures
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
@@ -29,9 +29,6 @@ from impactopt.problem.terms import (
 )
 from impactopt.problem.terms.first_touch import face_of
 from impactopt.robots.loads import weight_of
-
-if TYPE_CHECKING:
-    from impactopt.problem.problem import ImpactProblem
 
 Array = NDArray[np.float64]
 # [m] Distance outside the support polygon to which a motion may take the centre of mass for a short time.

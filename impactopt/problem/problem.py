@@ -28,49 +28,19 @@ from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.contact.targets.base import TOUCH, ContactPhase, contact_phases, order_of_touches
-from impactopt.errors import (
-    FARTHEST,
-    InputError,
-    Mistakes,
-    check_array,
-    check_kind,
-    check_name,
-)
+from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, check_kind, check_name
 from impactopt.kinematics.coordinates import MAX_START_PITCH, StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance
 from impactopt.kinematics.support import support_polygon
-from impactopt.problem.checks import (
-    COLLISIONS,
-    INSTANT,
-    check_apart,
-    check_at_rest,
-    check_collision,
-    check_elements,
-    check_energy,
-    check_gains,
-    check_hands,
-    check_hinges,
-    check_motors,
-    check_moves,
-    check_names,
-    check_prices,
-    check_stance,
-    check_strikers,
-    check_touches,
-    check_world,
-)
+from impactopt.problem import checks
+from impactopt.problem.checks import COLLISIONS, INSTANT
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
-from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
+from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective
+from impactopt.problem.objectives.base import check_objectives
 from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
-from impactopt.problem.stances import (
-    StancePhase,
-    check_stances,
-    impact_phase,
-    names_of,
-    phase_coordinates,
-)
+from impactopt.problem.stances import StancePhase, check_stances, impact_phase, names_of, phase_coordinates
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
@@ -82,9 +52,8 @@ from impactopt.problem.terms import (
     KeepOut,
     SelfCollision,
     Term,
-    check_known,
-    kind_of,
 )
+from impactopt.problem.terms.base import check_known, kind_of
 from impactopt.robots.attachments import Sole
 from impactopt.robots.gains import GainFactor
 from impactopt.robots.robot import Robot
@@ -213,32 +182,32 @@ class ImpactProblem:
         striker = mistakes.attempt(lambda: self.robot.striker(self.striker))
         aim = mistakes.attempt(self._check_aim)
         stance = mistakes.attempt(partial(check_stances, self)) and mistakes.attempt(
-            partial(check_stance, self)
+            partial(checks.check_stance, self)
         )
         stance = stance and mistakes.attempt(self._check_start)
-        for check in (check_elements, check_prices):
+        for check in (checks.check_elements, checks.check_prices):
             mistakes.attempt(partial(check, self))
-        collision = mistakes.attempt(partial(check_collision, self))
-        mistakes.attempt(partial(check_touches, self))
+        collision = mistakes.attempt(partial(checks.check_collision, self))
+        mistakes.attempt(partial(checks.check_touches, self))
         if mistakes.attempt(self._check_scenarios):
             for scenario in self.scenarios:
                 mistakes.attempt(partial(scenario.numbers, self.law, self.target))
-        mistakes.attempt(partial(check_world, self))
-        mistakes.attempt(partial(check_gains, self))
+        mistakes.attempt(partial(checks.check_world, self))
+        mistakes.attempt(partial(checks.check_gains, self))
         terms = mistakes.attempt(self._check_terms)
         if terms:
             for term in self.terms:
-                mistakes.attempt(partial(check_names, self.robot, term))
-            mistakes.attempt(partial(check_motors, self))
+                mistakes.attempt(partial(checks.check_names, self.robot, term))
+            mistakes.attempt(partial(checks.check_motors, self))
         if mistakes.attempt(self._check_objectives) and collision:
-            mistakes.attempt(partial(check_energy, self))
+            mistakes.attempt(partial(checks.check_energy, self))
         sound = striker and stance and terms and mistakes.attempt(partial(check_second, self))
         if sound:
-            mistakes.attempt(partial(check_hands, self))
-            mistakes.attempt(partial(check_hinges, self))
-        sound = sound and mistakes.attempt(partial(check_strikers, self))
+            mistakes.attempt(partial(checks.check_hands, self))
+            mistakes.attempt(partial(checks.check_hinges, self))
+        sound = sound and mistakes.attempt(partial(checks.check_strikers, self))
         if sound and aim and mistakes.attempt(lambda: self.contact_posture):
-            mistakes.attempt(partial(check_moves, self))
+            mistakes.attempt(partial(checks.check_moves, self))
         mistakes.raise_if_any("the problem")
 
     def _check_aim(self) -> None:
@@ -251,13 +220,10 @@ class ImpactProblem:
         object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
 
     def _check_scenarios(self) -> None:
-        listed = isinstance(self.scenarios, (list, tuple))
-        if not listed or not all(isinstance(s, Scenario) for s in self.scenarios):
-            raise InputError(f"scenarios must be a tuple of Scenario, not {self.scenarios!r}")
-        object.__setattr__(self, "scenarios", tuple(self.scenarios))
+        checks.check_parts(self, "scenarios", Scenario)
         if self.scenarios and not self.lasts:
             raise InputError(f'scenarios need a contact that lasts, as "full", not {self.collision!r}')
-        check_apart("scenario", [s.name for s in self.scenarios])
+        checks.check_apart("scenario", [s.name for s in self.scenarios])
         aborts = sorted({s.abort_after for s in self.scenarios if s.abort_after is not None})
         if len(aborts) > 1:
             raise InputError(
@@ -296,7 +262,7 @@ class ImpactProblem:
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, [sole.name for sole in self.soles])
         first = self.stance_coordinates[0]
-        check_at_rest(self.robot, first, [sole.name for sole in first.soles], posture)
+        checks.check_at_rest(self.robot, first, [sole.name for sole in first.soles], posture)
         if first.drifts and abs(first.start[4]) > MAX_START_PITCH:
             raise InputError(
                 f"the start posture's base is pitched by {first.start[4]:.2f} rad; a robot that floats "

@@ -15,6 +15,7 @@ from impactopt.errors import InputError, check_array, shortened
 from impactopt.kinematics.coordinates import LegClosure, StanceCoordinates
 from impactopt.kinematics.stance import BothSoles, OneSole, Stance
 from impactopt.kinematics.support import corners_at, overlap
+from impactopt.problem.checks import check_parts
 from impactopt.problem.scenario import Phase
 from impactopt.robots.robot import Robot
 
@@ -78,10 +79,7 @@ def check_stances(problem: Any) -> None:
     ------
     InputError : phases that are not a possible sequence, or that the problem's other parts exclude.
     """
-    given: Any = problem.stances
-    if not isinstance(given, (list, tuple)) or not all(isinstance(s, StancePhase) for s in given):
-        raise InputError(f"stances must be a tuple of StancePhase, not {given!r}")
-    object.__setattr__(problem, "stances", tuple(given))
+    check_parts(problem, "stances", StancePhase)
     stances, robot = problem.stances, problem.robot
     if not stances:
         return

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -18,13 +17,11 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import FirstTouch, HandOrientation, TorqueLimit
 from impactopt.problem.terms.first_touch import face_of
 from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
-
-if TYPE_CHECKING:
-    from impactopt.problem.problem import ImpactProblem
 
 Array = NDArray[np.float64]
 MAX_SWING = 1.2  # [rad], [m] travel of a joint from rest to contact

@@ -100,8 +100,18 @@ def say(console: Console, *texts: Any) -> None:
         console.print(printable(str(text)), markup=False, highlight=False, soft_wrap=whole)
 
 
-def say_details(console: Console, summary: Mapping[str, Any]) -> None:
-    """Prints the starts of a plan or a strike, if there are several, its violations, and its status."""
+def say_outcome(console: Console, summary: Mapping[str, Any]) -> None:
+    """Prints why a plan or a strike is not solved, its cautions, starts, violations, and its status."""
+    errors = (summary.get(name, {}).get("error") for name in ("simulated", "baseline"))
+    cautions = (summary.get("caution"), touches_message(summary), summary.get("gear_caution"))
+    say(
+        console,
+        reason_message(summary),
+        summary.get("note"),
+        *errors,
+        *cautions,
+        switched_off_message(summary),
+    )
     if len(summary["starts"]) > 1:
         console.print(multistart_table(summary["starts"]))
     if summary["violations"]:

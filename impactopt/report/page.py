@@ -65,19 +65,6 @@ def pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
     ).decode()
 
 
-def unpack(packed: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header and arrays of a packed text."""
-    data = zlib.decompress(base64.b64decode(packed))
-    start = 4 + int.from_bytes(data[:4], "little")
-    header = json.loads(data[4:start])
-    arrays = {}
-    for name, entry in header.pop("arrays").items():
-        kind, shape = np.dtype(entry["kind"]), entry["shape"]
-        count = int(np.prod(shape))
-        arrays[name] = np.frombuffer(data, kind, count, start + entry["place"]).reshape(shape)
-    return header, arrays
-
-
 # in this order: each uses those before it
 SCRIPTS = ("unpack", "geometry", "view", "player", "charts", "main")
 

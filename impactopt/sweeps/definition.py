@@ -17,20 +17,14 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from impactopt.codegen.files import is_plain_file, read_plain
+from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.named_problems import problem_file, sweep_file
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
 from impactopt.files.record import NUMBERS
 from impactopt.files.sections.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
-from impactopt.files.toml import (
-    LONGEST_TEXT,
-    Place,
-    TOMLError,
-    check_plain,
-    plain_value,
-    text_with_control,
-)
+from impactopt.files.sections.reading import read_text
+from impactopt.files.toml import Place, TOMLError, check_plain, plain_value, text_with_control
 from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.collisions import Collisions, sweep_place
 from impactopt.sweeps.design import Axis, Column, Design, Draws, Span, column
@@ -317,12 +311,7 @@ def read_sweep_file(
         their lines.
     """
     path = sweep_file(path)
-    try:
-        text = read_plain(path, LONGEST_TEXT).decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
-        raise InputError(f"cannot read {shortened(str(path), 300)}: {reason}") from error
-    return parse_sweep(text, path, settings)
+    return parse_sweep(read_text(path), path, settings)
 
 
 def parse_sweep(text: str, path: Path, settings: Mapping[str, Any] = MappingProxyType({})) -> Sweep:

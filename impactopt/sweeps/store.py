@@ -16,6 +16,7 @@ is not a journal, or whose pages are damaged, is refused, and nothing in it is c
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sqlite3
@@ -28,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.codegen.files import open_own
+from impactopt.codegen.files import UnsafePath, locked, open_own
 from impactopt.errors import InputError
 from impactopt.files.output import make_directory, save_record, write_file
 from impactopt.planning.solution import versions
@@ -182,14 +183,19 @@ class Store:
 
     def __init__(self, sweep: Sweep, out: Path) -> None:
         self.path = make_directory(out)
-        self._lock = _lock(self.path)
-        try:
+
+        def refuse() -> None:
+            raise InputError(f"another process is working on {self.path}; wait for it, or give another --out")
+
+        with contextlib.ExitStack() as held:
+            try:
+                held.enter_context(locked(self.path / ".lock", on_wait=refuse))
+            except UnsafePath as error:
+                raise InputError(f"{error}; remove it, or give another --out") from error
             self.hash = sweep.hash
             self._claim(sweep)
             self.journal = Journal(self.path / UNITS)
-        except BaseException:
-            os.close(self._lock)
-            raise
+            self._lock = held.pop_all()
 
     @property
     def table(self) -> Path:
@@ -207,7 +213,7 @@ class Store:
 
     def close(self) -> None:
         self.journal.close()
-        os.close(self._lock)
+        self._lock.close()
 
     def _claim(self, sweep: Sweep) -> None:
         """Write sweep.json in a new directory; InputError if it is there and of another sweep or version."""
@@ -252,26 +258,6 @@ class Store:
                 f"the rows in {self.path} were computed with {old}, and this is {new}; rows of both would "
                 "mix: install the same again, or give another --out"
             )
-
-
-def _lock(path: Path) -> int:
-    """Handle of a lock on the directory; the system releases it however the process ends."""
-    import fcntl  # POSIX only
-
-    try:
-        handle = open_own(path / ".lock", os.O_RDWR | os.O_CREAT, 0o600)
-    except OSError as error:
-        raise InputError(
-            f"cannot lock {path}: {path / '.lock'}: {error.strerror}; remove it, or give another --out"
-        ) from error
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(handle)
-        raise InputError(
-            f"another process is working on {path}; wait for it, or give another --out"
-        ) from error
-    return handle
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:

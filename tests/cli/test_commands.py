@@ -30,6 +30,7 @@ from impactopt.files.named_problems import problem_file
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import key_place, read_problem_file, read_toml, write_toml
 from impactopt.files.problem_file.reading import key_paths
+from impactopt.planning.solution import Solved
 from impactopt.report.console import output
 
 ROOT = Path(__file__).parents[2]
@@ -485,3 +486,9 @@ def test_keys_that_are_offered_come_from_the_cache(tmp_path: Path, monkeypatch: 
     first, second = (each.stdout.splitlines() for each in done)
     assert first[0] == second[0] == "['target.mass_kg=']"
     assert second[1] == "[]" != first[1]
+
+
+def test_a_strike_has_its_caution_beside_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without progress, too, which says it first."""
+    monkeypatch.setattr(Solved, "caution", property(lambda self: "the hand meets the target again"))
+    assert "the hand meets the target again" in run("strike", "arm_planar", "--starts", 1, "--quiet")[0]

@@ -260,6 +260,14 @@ def test_ros2_is_a_goal_that_replays_as_the_plan_does(arm: Solution, tmp_path: P
     np.testing.assert_allclose(trajectory["points"][-1]["velocities"], 0.0, atol=1e-9)
 
 
+def test_ros2_reads_small_round_numbers_as_numbers(planned: Planned, tmp_path: Path) -> None:
+    """YAML takes 1e-05 for text, and 1.0e-05 for a number."""
+    small = dataclasses.replace(planned.reference, torque=np.full_like(planned.reference.torque, 1e-5))
+    _, path = export_planned(dataclasses.replace(planned, reference=small), "ros2", tmp_path / "goal")
+    points = yaml.safe_load(path.read_text(encoding="utf-8"))["trajectory"]["points"]
+    assert {x for point in points for x in point["effort"]} == {1e-5}
+
+
 def test_effort_without_gravity_is_for_arms_that_hold_themselves(
     arm: Solution, still: Solution, tmp_path: Path
 ) -> None:

@@ -263,6 +263,8 @@ START = {"start": "s", "status": "solved", "impulse_Ns": 1.0, "seconds": 1.0, "i
         ("problem.point_m", ["x"]),
         ("problem.name", 3),
         ("impulse_Ns", True),
+        ("impulses_Ns", [1.0, "x"]),
+        ("replayed.grip_force_N", "x"),
         ("violations", [{"row": "x"}]),
         ("violations", [{"row": "x", "by": 3}]),
         ("starts", [{**START, "kept": 1}]),

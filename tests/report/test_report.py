@@ -15,6 +15,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from support.browser import DARK, WITHOUT_3D, Job, Visit, visit
 from support.fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_solution, strike_record
+from support.pages import unpack
 from support.small_robots import biped
 from typer.testing import CliRunner
 
@@ -39,7 +40,6 @@ from impactopt.files.output import record_of, save_record
 from impactopt.files.record import Record
 from impactopt.report.animation import animation_of
 from impactopt.report.comparison import compare
-from impactopt.report.page import unpack
 from impactopt.report.pictures.sheet import sheet
 from impactopt.report.pictures.style import ORANGE
 from impactopt.report.report import report_of

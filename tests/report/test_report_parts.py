@@ -12,6 +12,7 @@ import pinocchio as pin
 import pytest
 from scipy.integrate import trapezoid
 from support.fake_solution import still_problem, still_solution
+from support.pages import unpack
 
 from impactopt import (
     Board,
@@ -46,7 +47,7 @@ from impactopt.files.output import BITS, record_of
 from impactopt.files.record import Record
 from impactopt.report.charts import charts_of
 from impactopt.report.histories import thinned
-from impactopt.report.page import pack, unpack
+from impactopt.report.page import pack
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import FAR, tracks_of
 

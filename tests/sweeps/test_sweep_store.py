@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import resource
@@ -275,6 +277,15 @@ def test_two_processes_do_not_share_a_directory(tmp_path: Path) -> None:
             Store(sweep(), tmp_path)
         other.kill()
     Store(sweep(), tmp_path).close()  # a killed process holds nothing
+
+
+def test_a_disk_without_locks_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(handle: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with pytest.raises(InputError, match=r"\.lock cannot be locked: .*; remove it, or give another --out"):
+        Store(sweep(), tmp_path)
 
 
 # ---------------------------------------------------------------- the table

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +29,8 @@ from impactopt.files.draft.strong import FOLLOW, ITERATIONS, SECONDS, SWING, Str
 from impactopt.files.draft.target_placement import STRIKE_DIRECTIONS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
-from impactopt.files.problem_file.writing import sole_data, striker_data, tool_data
+from impactopt.files.problem_file.writing import ROBOT_KEYS, relative_path, section_data, sole_data
+from impactopt.files.sections.robot import StrikerSection, ToolSection
 from impactopt.files.toml import Place, plain_value, write_toml
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
@@ -154,6 +154,11 @@ def _of_motion(
         return replace(kick, said=(*kick.said, f"a kick is drafted, as there is no punch: {no_punch}"))
 
 
+def _draft(data: dict[str, Any], drafted: Drafted, robot: Robot, *messages: str) -> Draft:
+    """Draft of a file's data, with its own messages and others."""
+    return Draft(text=_text(data, drafted, robot), said=(*_messages(data, drafted, robot), *messages))
+
+
 def _standing(
     drafted: Drafted, soles: list[Sole], strikers: list[Striker], forward: Array
 ) -> tuple[Robot, tuple[Limb, ...], Array]:
@@ -189,7 +194,7 @@ def _punch(
     # from the start: a push that slides off the target is refused for its replay before its slide is bounded
     data["terms"]["slide"] = {"most_m": Slide().most}
     data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
-    return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
+    return _draft(data, drafted, robot)
 
 
 def _bolted(
@@ -259,7 +264,7 @@ def _bolted(
                 raise
             raise InputError(f"{drafted.path}: no strike of {arms[0].name!r} is found{why}") from no_target
         messages = [UNSOLVED + why]
-    return Draft(text=_text(data, drafted, robot), said=(*_messages(data, drafted, robot), *messages))
+    return _draft(data, drafted, robot, *messages)
 
 
 def _hardest(robot: Robot, arm: Arm, q: Array, targets: list[Hit]) -> tuple[list[Strong], Hit, bool, str]:
@@ -367,7 +372,7 @@ def _stroke(
         say("turning the hand's face to the target")
         if not _strike(data, folder, start=solved).status.usable:
             data, messages = _edgewise(data), [EDGEWISE]
-    return Draft(text=_text(data, drafted, robot), said=(*_messages(data, drafted, robot), *messages))
+    return _draft(data, drafted, robot, *messages)
 
 
 def _edgewise(data: dict[str, Any]) -> dict[str, Any]:
@@ -419,7 +424,7 @@ def _kick(
     data["contact"] = {"stiffness_N_m": 2e4, "damping_N_s_m": 20.0}
     points = (np.round([part * hip_height, at[1], size / 2], 3) + 0.0 for part in KICKS)
     data = _aimed(data, toe.name, points, np.array(STRIKE_DIRECTIONS[0]), folder)
-    return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
+    return _draft(data, drafted, robot)
 
 
 def _hardest_planned(
@@ -485,26 +490,17 @@ def _data(
     drafted: Drafted, robot: Robot, soles: list[Sole], strikers: list[Striker], q: Array, folder: Path
 ) -> dict[str, Any]:
     """Data of a problem file with a robot in its start posture q (nq,), without a hit point."""
-    absolute, base = drafted.path.resolve(), folder.resolve()
-    kind = "mjcf" if drafted.mjcf else "urdf"
-    options, keys = drafted.options, dict[str, Any]()
-    keys[kind] = os.path.relpath(absolute, base) if absolute.is_relative_to(base) else str(absolute)
-    keys["name"] = robot.name
+    options = drafted.options
+    keys: dict[str, Any] = {drafted.kind.lower(): relative_path(drafted.path, folder), "name": robot.name}
     if "floating" in options:
         keys["floating"] = options["floating"]
-    for option, key in (
-        ("locked", "locked_rad"),
-        ("armature", "armature_kg_m2"),
-        ("torque_limit", "torque_limit_N_m"),
-        ("velocity_limit", "velocity_limit_rad_s"),
-        ("position_limit", "position_limit_rad"),
-    ):
+    for option in ("locked", "armature", "torque_limit", "velocity_limit", "position_limit"):
         if options.get(option):
-            keys[key] = dict(options[option])
+            keys[ROBOT_KEYS[option]] = dict(options[option])
     if soles:
         keys["soles"] = [sole_data(sole) for sole in soles]
-    keys["strikers"] = [striker_data(striker) for striker in strikers]
-    keys |= {"tools": [tool_data(tool) for tool in robot.tools]} if robot.tools else {}
+    keys["strikers"] = [section_data(StrikerSection, striker) for striker in strikers]
+    keys |= {"tools": [section_data(ToolSection, tool) for tool in robot.tools]} if robot.tools else {}
     angles = zip(robot.joint_names, robot.joint_positions(q), robot.hinges, strict=True)
     keys["postures_rad"] = {START: {joint: round(float(x), 5) for joint, x, hinge in angles if not hinge}}
     mass = sum(float(body.mass) for body in robot.model.inertias)
@@ -614,17 +610,12 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         head.append(f"# {text}.")
     if drafted.wrong:
         head += [
-            f"# {_wrong(drafted)}. Correct the {robot_kind(drafted)}, or remove "
+            f"# {_wrong(drafted)}. Correct the {drafted.kind}, or remove "
             'the # before `inertias = "repaired"`:',
             *(f"#   {text.partition('; correct')[0]}" for text in drafted.wrong),
         ]
     text = write_toml(data, comment, hidden).rstrip("\n")
     return "\n".join([*head, "", text, "", *_frames(robot), ""])
-
-
-def robot_kind(drafted: Drafted) -> str:
-    """Format of the robot's description."""
-    return "MJCF" if drafted.mjcf else "URDF"
 
 
 def _reasons(locked: Mapping[str, str]) -> Iterator[str]:
@@ -679,7 +670,7 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
     ):
         if key in data["robot"]:
             of = f"{what} of {counted(len(data['robot'][key]), 'joint')}"
-            yield f"guessed, as the {robot_kind(drafted)} has no plausible ones: {of}"
+            yield f"guessed, as the {drafted.kind} has no plausible ones: {of}"
     if guessed := int(_guessed_gains(robot).sum()):
         yield (
             f"guessed: servo gains of {counted(guessed, 'joint')}, kd = 1.5 s x torque limit, at most 150, "

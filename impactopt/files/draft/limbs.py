@@ -62,7 +62,7 @@ def limbs_of(model: pin.Model) -> tuple[Limb, ...]:
     return tuple(out)
 
 
-def _range(model: pin.Model, j: int) -> tuple[float, float]:
+def range_of(model: pin.Model, j: int) -> tuple[float, float]:
     """Range [rad], [m] of a joint; infinite of those that have none, such as continuous ones."""
     k = model.joints[j].idx_q
     if model.joints[j].nq != 1:
@@ -76,12 +76,14 @@ def to_lock(model: pin.Model) -> dict[str, str]:
     """
     children, out = _children(model), dict[str, str]()
     first = 2 if is_floating(model) else 1
-    mass, total = _moved_mass(model, children), sum(float(body.mass) for body in model.inertias)
+    data = model.createData()
+    pin.computeSubtreeMasses(model, data)
+    mass, total = list(data.mass), float(data.mass[0])
     reach = _reach(model, children)
     effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
-    weight = np.abs(pin.computeGeneralizedGravity(model, model.createData(), neutral(model)))
+    weight = np.abs(pin.computeGeneralizedGravity(model, data, neutral(model)))
     for j in range(model.njoints - 1, first - 1, -1):
-        joint, name, (low, high) = model.joints[j], str(model.names[j]), _range(model, j)
+        joint, name, (low, high) = model.joints[j], str(model.names[j]), range_of(model, j)
         if low > high:
             continue  # crossed limits are a mistake of the file, which the robot's checks report
         if not low < high:
@@ -97,7 +99,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
         elif "JointModelP" in joint.shortname() and high - low > TRAVEL:
             # what turns such a slide, or turns on it without a limit, steers the base
             steering = [i for i in model.supports[j] if i >= first]
-            steering += [i for i in children[j] if np.ptp(_range(model, i)) > TURN]
+            steering += [i for i in children[j] if np.ptp(range_of(model, i)) > TURN]
             out |= {str(model.names[i]): "drives a base" for i in steering}
     for j in range(first, model.njoints):  # a hand: several short and light chains on one link
         small = [c for c in children[j] if mass[c] < FINGER_MASS * total and reach[c] < FINGER_LENGTH]
@@ -206,13 +208,6 @@ def _children(model: pin.Model) -> dict[int, list[int]]:
 
 def _subtree(joint: int, children: Mapping[int, list[int]]) -> list[int]:
     return [joint, *(i for c in children[joint] for i in _subtree(c, children))]
-
-
-def _moved_mass(model: pin.Model, children: Mapping[int, list[int]]) -> dict[int, float]:
-    """Mass [kg] that each joint moves."""
-    return {
-        j: sum(float(model.inertias[i].mass) for i in _subtree(j, children)) for j in range(model.njoints)
-    }
 
 
 def _reach(model: pin.Model, children: Mapping[int, list[int]]) -> dict[int, float]:

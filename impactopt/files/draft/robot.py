@@ -15,7 +15,7 @@ from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.draft.default_drives import RANGE, Drives, guess_drives
-from impactopt.files.draft.limbs import Limb, arms_of, legs_of, limbs_of, to_lock, toes, unshared
+from impactopt.files.draft.limbs import Limb, arms_of, legs_of, limbs_of, range_of, to_lock, toes, unshared
 from impactopt.robots.build import is_floating, lock_joints
 from impactopt.robots.checks import LEG, REPAIRED, check_inertias
 from impactopt.robots.couplings import unfit
@@ -59,14 +59,18 @@ class Drafted:
         return self.robot.mjcf is not None
 
     @property
+    def kind(self) -> str:
+        """Format of the description."""
+        return "MJCF" if self.mjcf else "URDF"
+
+    @property
     def freed(self) -> bool:
         """True if the robot stands although its MJCF has no free joint."""
         return self.mjcf and self.robot.floating and not is_floating(read_mjcf(self.path).model)
 
     def made(self, **more: Any) -> Robot:
         """The robot read again, with additional options."""
-        make = Robot.from_mjcf if self.mjcf else Robot.from_urdf
-        return make(self.path, inertias=REPAIRED, **{**self.options, **more})
+        return _robot(self.path, self.mjcf, {**self.options, **more})
 
 
 def find_description(given: str) -> Path:
@@ -282,9 +286,7 @@ def _made(
     ):
         options |= {key: values} if values else {}
     out = Drafted(
-        robot=Robot.from_mjcf(path, inertias=REPAIRED, **options)
-        if mjcf
-        else Robot.from_urdf(path, inertias=REPAIRED, **options),
+        robot=_robot(path, mjcf, options),
         path=path,
         options=options,
         locked=locked,
@@ -300,12 +302,14 @@ def _made(
     return replace(out, pieces={joint: tuple(several) for joint, several in pieces.items()})
 
 
+def _robot(path: Path, mjcf: bool, options: Mapping[str, Any]) -> Robot:
+    """The robot of a file, with repaired inertias."""
+    return (Robot.from_mjcf if mjcf else Robot.from_urdf)(path, inertias=REPAIRED, **options)
+
+
 def _rest(model: pin.Model, name: str) -> float:
     """The angle nearest to zero inside the limits."""
-    joint = model.joints[model.getJointId(name)]
-    if joint.nq != 1:
-        return 0.0
-    low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+    low, high = range_of(model, model.getJointId(name))
     return float(np.clip(0.0, low, high)) if low <= high else 0.0
 
 
@@ -314,20 +318,17 @@ def _followed(model: pin.Model, tie: Tie, angles: Mapping[str, float]) -> float:
 
     An arm with a follower that is locked straight has little reach.
     """
-    follower = model.joints[model.getJointId(tie.follower)]
     leader = next((joint for joint in tie.joints if joint != tie.follower), None)
     angle = 0.0 if leader is None else angles.get(leader, _bent(model, leader))
-    low, high = (model.lowerPositionLimit[follower.idx_q], model.upperPositionLimit[follower.idx_q])
+    low, high = range_of(model, model.getJointId(tie.follower))
     followed = float(np.polynomial.polynomial.polyval(angle, tie.follows))
-    return float(np.clip(followed, low, high)) if follower.nq == 1 and low <= high else followed
+    return float(np.clip(followed, low, high)) if low <= high else followed
 
 
 def _bent(model: pin.Model, name: str) -> float:
     """The angle of a joint at a quarter of its range; 0 without limits."""
-    if not model.existJointName(name) or (joint := model.joints[model.getJointId(name)]).nq != 1:
-        return 0.0
-    low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-    return float(low + 0.25 * (high - low)) if np.isfinite([low, high]).all() else 0.0
+    low, high = range_of(model, model.getJointId(name)) if model.existJointName(name) else (0.0, 0.0)
+    return low + 0.25 * (high - low) if np.isfinite([low, high]).all() else 0.0
 
 
 def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> None:

@@ -33,33 +33,16 @@ _PARTS = {
     "trajectory_msgs/JointTrajectoryPoint": "float64[] positions\nfloat64[] velocities\n"
     "float64[] accelerations\nfloat64[] effort\nbuiltin_interfaces/Duration time_from_start",
 }
-_HEADER = ("builtin_interfaces/Time", "std_msgs/Header")
-_TYPES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "trajectory_msgs/msg/JointTrajectory": (
-        "std_msgs/Header header\nstring[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points",
-        (*_HEADER, "builtin_interfaces/Duration", "trajectory_msgs/JointTrajectoryPoint"),
-    ),
-    "geometry_msgs/msg/WrenchStamped": (
-        "std_msgs/Header header\ngeometry_msgs/Wrench wrench",
-        (*_HEADER, "geometry_msgs/Vector3", "geometry_msgs/Wrench"),
-    ),
-    "geometry_msgs/msg/PointStamped": (
-        "std_msgs/Header header\ngeometry_msgs/Point point",
-        (*_HEADER, "geometry_msgs/Point"),
-    ),
-    "geometry_msgs/msg/PoseStamped": (
-        "std_msgs/Header header\ngeometry_msgs/Pose pose",
-        (*_HEADER, "geometry_msgs/Point", "geometry_msgs/Quaternion", "geometry_msgs/Pose"),
-    ),
-    "geometry_msgs/msg/TwistStamped": (
-        "std_msgs/Header header\ngeometry_msgs/Twist twist",
-        (*_HEADER, "geometry_msgs/Vector3", "geometry_msgs/Twist"),
-    ),
-    "sensor_msgs/msg/JointState": (
-        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort",
-        _HEADER,
-    ),
-    "std_msgs/msg/UInt8": ("uint8 data", ()),
+_TYPES = {
+    "trajectory_msgs/msg/JointTrajectory": "std_msgs/Header header\nstring[] joint_names\n"
+    "trajectory_msgs/JointTrajectoryPoint[] points",
+    "geometry_msgs/msg/WrenchStamped": "std_msgs/Header header\ngeometry_msgs/Wrench wrench",
+    "geometry_msgs/msg/PointStamped": "std_msgs/Header header\ngeometry_msgs/Point point",
+    "geometry_msgs/msg/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
+    "geometry_msgs/msg/TwistStamped": "std_msgs/Header header\ngeometry_msgs/Twist twist",
+    "sensor_msgs/msg/JointState": "std_msgs/Header header\nstring[] name\nfloat64[] position\n"
+    "float64[] velocity\nfloat64[] effort",
+    "std_msgs/msg/UInt8": "uint8 data",
 }
 
 
@@ -97,8 +80,17 @@ def write(export: Export, directory: Path) -> None:
 
 
 def _definition(name: str) -> str:
-    own, parts = _TYPES[name]
-    return "\n".join([own, *(f"{_RULE}\nMSG: {part}\n{_PARTS[part]}" for part in parts)])
+    parts = dict.fromkeys(_parts(_TYPES[name]))
+    return "\n".join([_TYPES[name], *(f"{_RULE}\nMSG: {part}\n{_PARTS[part]}" for part in parts)])
+
+
+def _parts(definition: str) -> Iterator[str]:
+    """Names of the messages in a definition, and of those in them."""
+    for line in definition.splitlines():
+        kind = line.split()[0].removesuffix("[]")
+        if kind in _PARTS:
+            yield kind
+            yield from _parts(_PARTS[kind])
 
 
 def _trajectory(export: Export, motion: Motion) -> dict[str, Any]:

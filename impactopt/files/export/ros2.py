@@ -43,5 +43,8 @@ def _lines(export: Export, motion: Motion) -> Iterator[str]:
 
 
 def _numbers(values: Any) -> str:
-    """YAML list of numbers with decimal points: ROS does not accept integers for floats."""
-    return f"[{', '.join(repr(float(f'{x:.10g}')) for x in np.asarray(values))}]"
+    """YAML list of numbers with decimal points: ROS accepts no integers for floats, and YAML takes 1e-05 for
+    text.
+    """
+    texts = (repr(float(f"{x:.10g}")) for x in np.asarray(values))
+    return f"[{', '.join(text if '.' in text else text.replace('e', '.0e') for text in texts)}]"

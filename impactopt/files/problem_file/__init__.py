@@ -7,36 +7,19 @@
 * reference.py  docs/problem_files.md, and the comments of `impactopt new`
 """
 
-from impactopt.files.named_problems import problem_names
-from impactopt.files.problem_file.reading import (
-    ProblemFile,
-    change_data,
-    key_place,
-    load_problem,
-    parse_problem_file,
-    problem_file_from_data,
-    problem_from_data,
-    read_problem_file,
-)
-from impactopt.files.problem_file.sections import SolverSettings
-from impactopt.files.problem_file.writing import problem_data, write_problem
-from impactopt.files.sections.reading import parse_settings
-from impactopt.files.toml import read_toml, write_toml
-
-__all__ = [
-    "ProblemFile",
-    "SolverSettings",
-    "change_data",
-    "key_place",
-    "load_problem",
-    "parse_problem_file",
-    "parse_settings",
-    "problem_data",
-    "problem_file_from_data",
-    "problem_from_data",
-    "problem_names",
-    "read_problem_file",
-    "read_toml",
-    "write_problem",
-    "write_toml",
-]
+# X as X: a name that is exported, for type checkers, too
+from impactopt.files.named_problems import problem_names as problem_names
+from impactopt.files.problem_file.reading import ProblemFile as ProblemFile
+from impactopt.files.problem_file.reading import change_data as change_data
+from impactopt.files.problem_file.reading import key_place as key_place
+from impactopt.files.problem_file.reading import load_problem as load_problem
+from impactopt.files.problem_file.reading import parse_problem_file as parse_problem_file
+from impactopt.files.problem_file.reading import problem_file_from_data as problem_file_from_data
+from impactopt.files.problem_file.reading import problem_from_data as problem_from_data
+from impactopt.files.problem_file.reading import read_problem_file as read_problem_file
+from impactopt.files.problem_file.sections import SolverSettings as SolverSettings
+from impactopt.files.problem_file.writing import problem_data as problem_data
+from impactopt.files.problem_file.writing import write_problem as write_problem
+from impactopt.files.sections.reading import parse_settings as parse_settings
+from impactopt.files.toml import read_toml as read_toml
+from impactopt.files.toml import write_toml as write_toml

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
@@ -13,15 +13,9 @@ from pydantic.fields import FieldInfo
 from impactopt.errors import FARTHEST, MANY, MOST
 from impactopt.files.named_problems import problem_file, problem_summary
 from impactopt.files.problem_file.reading import read_problem_file
-from impactopt.files.problem_file.sections import (
-    File,
-    TermSections,
-    about_section,
-    comment_at,
-    defaults_of,
-)
+from impactopt.files.problem_file.sections import File, TermSections, about_section, comment_at, defaults_of
 from impactopt.files.sections.collision import LAWS, TARGETS, with_kinds
-from impactopt.files.sections.diagnostics import range_of, section_at
+from impactopt.files.sections.diagnostics import range_of, section_at, section_in
 from impactopt.files.sections.reading import LONGEST_KEY
 from impactopt.files.sections.values import Section
 from impactopt.files.toml import DEEPEST, LONGEST_TEXT, Place, plain_value, write_toml
@@ -84,11 +78,9 @@ def _left_out(data: dict[str, Any]) -> list[str]:
     ]
     lines = ["# There may be more sections; `impactopt new --reference` says what is in them:"]
     for name, info in found:
-        kind: Any = info.annotation
-        many = not isinstance(kind, type)
-        section = kind.__args__[0] if many else kind
+        header = f"[[{name}]]" if get_origin(info.annotation) is list else f"[{name}]"
         if name != "robot":
-            lines.append(f"#   {f'[[{name}]]' if many else f'[{name}]'}  {about_section(section)}")
+            lines.append(f"#   {header}  {about_section(section_in(info.annotation))}")
     return lines
 
 
@@ -137,7 +129,6 @@ _LIMITS = (
     ("`[collision] elements`", f"{MOST_ELEMENTS} a phase"),
     ("`[[scenarios]]`, and `[[obstacles]]`", f"{MANY} each"),
 )
-_SEVERAL = 4  # common first keys of two sections from which on they are listed once
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
 
@@ -145,71 +136,42 @@ def reference() -> str:
     """The page, in Markdown."""
     limits = "\n".join(f"* {what}: {most}" for what, most in _LIMITS)
     parts = [_INTRODUCTION.replace("{limits}", limits)]
-    seen: dict[tuple[str, ...], str] = {}
     several: dict[str, Mapping[str, type[Section]]] = {"target": TARGETS, "contact": LAWS}
     for name, info in File.model_fields.items():
         kinds = several.get(name, {})
         for kind, section in kinds.items():
             (choice,) = (i.alias or n for n, i in section.model_fields.items() if n == section.choice)
             note = ". The default" if kind == section.model_fields[section.choice].default else ""
-            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, seen, note))
+            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, note))
         below = _sections(name, info)
         if kinds:
             next(below)  # the section itself, whose keys are all listed by kind
-        parts += [_part(header, section, seen) for header, section in below]
+        parts += [_part(header, section) for header, section in below]
     return "\n".join(parts)
 
 
 def _sections(place: str, info: FieldInfo) -> Iterator[tuple[str, type[BaseModel]]]:
     """A section and its subsections, with their headers."""
-    section, many = _inner(info)
+    section, form = section_in(info.annotation), get_origin(info.annotation)
     if section is None:
         return
-    place = f"{place}.NAME" if get_origin(info.annotation) is dict else place
-    yield (f"[[{place}]]" if many else f"[{place}]"), section
+    place = f"{place}.NAME" if form is dict else place
+    yield (f"[[{place}]]" if form is list else f"[{place}]"), section
     for name, inner in section.model_fields.items():
         yield from _sections(f"{place}.{name}", inner)
 
 
-def _inner(info: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
-    """The section in a field, None if it has none; and True if it has a list of them."""
-    many = get_origin(info.annotation) is list
-    named = get_origin(info.annotation) is dict
-    kind = get_args(info.annotation)[-1] if many or named else info.annotation
-    return (kind, many) if isinstance(kind, type) and issubclass(kind, BaseModel) else (None, many)
-
-
-def _part(header: str, section: type[BaseModel], seen: dict[tuple[str, ...], str], note: str = "") -> str:
-    """Markdown of a section and its keys.
-
-    seen : headers of earlier sections by their keys, to refer to instead of listing the same keys again.
-    """
-    lines = [f"## `{header}`", "", f"{about_section(section)}{note}."]
-    keys = list(_keys(section))
-    known = max(seen, key=lambda other: _common(keys, other), default=())
-    same = _common(keys, known)
-    if same >= _SEVERAL or (same > 1 and same == len(keys) == len(known)):
-        last = "" if same == len(known) else f" up to {known[same - 1].split()[1]}"
-        lines[-1] += f" Keys: as in `{seen[known]}`{last}{', and' if same < len(keys) else '.'}"
-        keys = keys[same:]
-    elif keys:
-        seen[tuple(keys)] = header
-    lines += ["", *keys] if keys else []
-    return "\n".join([*lines, ""])
-
-
-def _common(keys: Sequence[str], others: Sequence[str]) -> int:
-    """Number of equal keys at the beginning of two sections."""
-    return next(
-        (k for k, (a, b) in enumerate(zip(keys, others, strict=False)) if a != b), min(len(keys), len(others))
-    )
+def _part(header: str, section: type[BaseModel], note: str = "") -> str:
+    """Markdown of a section and its keys."""
+    lines, keys = [f"## `{header}`", "", f"{about_section(section)}{note}."], list(_keys(section))
+    return "\n".join([*lines, *(["", *keys] if keys else []), ""])
 
 
 def _keys(section: type[BaseModel]) -> Iterator[str]:
     """A line for each key of the section itself."""
     defaults = defaults_of(section) if issubclass(section, Section) else {}
     for name, info in section.model_fields.items():
-        if _inner(info)[0] is not None or name == getattr(section, "choice", ""):
+        if section_in(info.annotation) is not None or name == getattr(section, "choice", ""):
             continue  # a subsection, or in the header
         if info.is_required():
             default = "**needed**"

@@ -176,9 +176,12 @@ class File(CollisionSections):
         """Arguments of `ImpactProblem` that the file gives, without robot and stance."""
         out = {name: value for name, value in self.problem.given().items() if name != "robot"}
         out |= {"law": self.contact.build(), "target": self.target.build()}
-        out |= {
-            name: getattr(self, name).build() for name in ("second", "swing", "follow") if getattr(self, name)
-        }
+        for name in ("second", "swing", "follow", "friction", "ground"):
+            if (section := getattr(self, name)) is not None:
+                out[name] = section.build()
+        for name in ("stances", "scenarios", "obstacles"):
+            if (sections := getattr(self, name)) is not None:
+                out[name] = tuple(each.build() for each in sections)
         out |= self.objective.given() if self.objective else {}
         if self.collision is not None:
             given = self.collision.given()
@@ -191,16 +194,6 @@ class File(CollisionSections):
             out["gains"] = self.robot.choices
         if self.target.body is not None:
             out["body"] = self.target.body.build()
-        if self.obstacles is not None:
-            out["obstacles"] = tuple(obstacle.build() for obstacle in self.obstacles)
-        if self.ground is not None:
-            out["ground"] = self.ground.build()
-        if self.friction is not None:
-            out["friction"] = self.friction.build()
-        if self.stances is not None:
-            out["stances"] = tuple(stance.build() for stance in self.stances)
-        if self.scenarios is not None:
-            out["scenarios"] = tuple(scenario.build() for scenario in self.scenarios)
         for name, section in (("terms", self.terms), ("objectives", self.objectives)):
             if section is not None:
                 found = (getattr(section, field) for field in type(section).model_fields)

@@ -11,54 +11,31 @@ from typing import Any
 import numpy as np
 
 from impactopt.bodies.world import TargetBody
-from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_kind
 from impactopt.files.problem_file.reading import problem_file_from_data
-from impactopt.files.problem_file.sections import (
-    ELEMENTS,
-    File,
-    FollowSection,
-    GroundSection,
-    ObjectiveSection,
-    ObjectiveSections,
-    ObstacleSection,
-    ScenarioSection,
-    SecondSection,
-    SolverSettings,
-    SwingSection,
-    TermSections,
-    comment_at,
-    defaults_of,
+from impactopt.files.problem_file.sections import ELEMENTS, File, SolverSettings, comment_at, defaults_of
+from impactopt.files.sections.collision import LAWS, TARGETS, Body, ProblemSection
+from impactopt.files.sections.diagnostics import section_in
+from impactopt.files.sections.robot import (
+    ActuatorSection,
+    GripSection,
+    RobotSection,
+    StrikerSection,
+    ToolSection,
 )
-from impactopt.files.sections.collision import (
-    LAWS,
-    TARGETS,
-    Body,
-    CollisionSection,
-    FrictionSection,
-    ProblemSection,
-    StancePhaseSection,
-)
-from impactopt.files.sections.robot import RobotSection
 from impactopt.files.sections.values import Section
 from impactopt.files.toml import plain_value, write_toml
 from impactopt.kinematics.stance import OneSole
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS
 from impactopt.robots.actuators import Actuator
-from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.checks import GIVEN
-from impactopt.robots.robot import Robot, Sole, Striker, Tool
+from impactopt.robots.robot import Robot, Sole
 
-BY_JOINT = {
-    "armature": "armature_kg_m2",
-    "torque_limit": "torque_limit_N_m",
-    "velocity_limit": "velocity_limit_rad_s",
-    "kd": "kd_N_m_s_rad",
-    "kp": "kp_N_m_rad",
-}
+ROBOT_KEYS = {name: info.alias or name for name, info in RobotSection.model_fields.items()}
+BY_JOINT = ("armature", "torque_limit", "velocity_limit", "kd", "kp")
 ROUNDS = 4  # of comparing with the robot: a torque limit changes the default of kd, and kd that of kp
 
 
@@ -94,13 +71,13 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
     options = {name: value for name, value in source.options.items() if value is not None}
     data: dict[str, Any] = {} if source.preset is None else {"preset": source.preset}
     if source.urdf is not None:
-        data["urdf"] = _relative(source.urdf, folder)
+        data["urdf"] = relative_path(source.urdf, folder)
     if source.mjcf is not None:
-        data["mjcf"] = _relative(source.mjcf, folder)
+        data["mjcf"] = relative_path(source.mjcf, folder)
     if options.get("inertias", GIVEN) != GIVEN:
         data["inertias"] = options["inertias"]
     if "srdf" in options:
-        data["srdf"] = _relative(options["srdf"], folder)
+        data["srdf"] = relative_path(options["srdf"], folder)
     if "name" in options:
         data["name"] = options["name"]
     if "floating" in options and (source.mjcf is not None or not options["floating"]):
@@ -111,18 +88,18 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
     angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
     if angles or (locked != () and source.preset is not None):
         data["locked_rad"] = plain_value(angles)
-    for name, key in BY_JOINT.items():
+    for name in BY_JOINT:
         if isinstance(options.get(name), (int, float, Mapping)):
-            data[key] = plain_value(options[name])
+            data[ROBOT_KEYS[name]] = plain_value(options[name])
     if "soles" in options:
         data["soles"] = [sole_data(sole) for sole in options["soles"]]
     if options.get("strikers") and source.preset is None:
-        data["strikers"] = [striker_data(striker) for striker in options["strikers"]]
+        data["strikers"] = [section_data(StrikerSection, striker) for striker in options["strikers"]]
     if source.tools:
-        data["tools"] = [tool_data(tool) for tool in source.tools]
-    grips = {tool.name: _grip(tool.grip) for tool in robot.tools if tool.grip is not None}
+        data["tools"] = [section_data(ToolSection, tool) for tool in source.tools]
+    grips = {tool.name: tool.grip for tool in robot.tools if tool.grip is not None}
     if grips:
-        data["grips"] = grips
+        data["grips"] = {name: section_data(GripSection, grip) for name, grip in grips.items()}
     postures = options.get("postures", {})
     named = {name: plain_value(angles) for name, angles in postures.items() if isinstance(angles, Mapping)}
     return data | ({"postures_rad": named} if named else {})
@@ -136,11 +113,11 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
     if built.joint_names != robot.joint_names:
         return out
     joints = robot.joint_names
-    for name, key in BY_JOINT.items():
+    for name in BY_JOINT:
         old, new = getattr(built, name), getattr(robot, name)
         changed = {joint: float(b) for joint, a, b in zip(joints, old, new, strict=True) if a != b}
         if changed:
-            out[key] = changed
+            out[ROBOT_KEYS[name]] = changed
             return out  # defaults of the others may depend on it
     limits = zip(joints, built.lower, built.upper, robot.lower, robot.upper, strict=True)
     moved = {joint: [float(c), float(d)] for joint, a, b, c, d in limits if (a, b) != (c, d)}
@@ -154,12 +131,11 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
     if pairs:
         out["disable_collisions"] = pairs
     of_tools = {tool.name for tool in (robot.source.tools if robot.source else ())}
-    strikers = [
-        striker_data(striker)
-        for name, striker in robot.strikers.items()
-        if name not in built.strikers or striker_data(built.strikers[name]) != striker_data(striker)
-        if name not in of_tools
-    ]
+    known, own = (
+        {name: section_data(StrikerSection, striker) for name, striker in each.strikers.items()}
+        for each in (built, robot)
+    )
+    strikers = [own[name] for name in own if own[name] != known.get(name) and name not in of_tools]
     return out | ({"strikers": strikers} if strikers else {})
 
 
@@ -168,19 +144,13 @@ def _actuators(robot: Robot) -> list[dict[str, Any]]:
     groups: dict[Actuator, list[str]] = {}
     for k in np.flatnonzero(~robot.passive):
         groups.setdefault(robot.actuators[k], []).append(robot.joint_names[k])
-    default = Actuator()
     return [
-        {"joints": joints}
-        | {
-            description.key_of(field.name): value
-            for field, description in abouts(Actuator)
-            if (value := getattr(actuator, field.name)) != getattr(default, field.name)
-        }
+        {"joints": joints} | section_data(ActuatorSection, actuator, ("joints",))
         for actuator, joints in groups.items()
     ]
 
 
-def _relative(path: Any, folder: Path) -> str:
+def relative_path(path: Any, folder: Path) -> str:
     """A path relative to the folder if it is in or below it, else the absolute path."""
     absolute, base = Path(path).expanduser().resolve(), folder.resolve()
     return str(absolute.relative_to(base) if absolute.is_relative_to(base) else absolute)
@@ -195,32 +165,6 @@ def sole_data(sole: Sole) -> dict[str, Any]:
     if sole.hinge is not None:
         data |= {"hinge": sole.hinge, "hinge_range_rad": float(sole.hinge_range)}
     return data
-
-
-def striker_data(striker: Striker) -> dict[str, Any]:
-    return {"name": striker.name, "frame": striker.frame, "point_m": striker.point.tolist()}
-
-
-def tool_data(tool: Tool) -> dict[str, Any]:
-    return {
-        "name": tool.name,
-        "frame": tool.frame,
-        "mass_kg": float(tool.mass),
-        "center_m": tool.center.tolist(),
-        "inertia_kg_m2": tool.inertia.tolist(),
-        "head_m": tool.head.tolist(),
-        **({} if tool.bar is None else {"bar_m": tool.bar.tolist(), "bar_width_m": float(tool.bar_width)}),
-    }
-
-
-def _grip(grip: SoftGrip) -> dict[str, Any]:
-    return {
-        "axis": grip.axis.tolist(),
-        "point_m": grip.point.tolist(),
-        "stiffness_N_m_rad": grip.stiffness,
-        "damping_N_m_s_rad": grip.damping,
-        "range_rad": grip.range,
-    }
 
 
 def write_problem(
@@ -281,7 +225,7 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     hands = {"hands": [hand.name for hand in fixed_hands]} if fixed_hands else {}
     data["stances"] = [
         {"soles": list(each.soles)}
-        | ({} if each.phase is None else _section(StancePhaseSection, each.phase, ("soles", "steps")))
+        | ({} if each.phase is None else _section("stances", each.phase, ("soles", "steps")))
         | ({"steps_m": {name: list(step) for name, step in each.steps.items()}} if each.steps else {})
         for each in problem.stances
     ]
@@ -290,32 +234,39 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     if (isinstance(stance, OneSole) and not problem.stances) or hands:
         data["stance"] = ({"soles": stance.name} if isinstance(stance, OneSole) else {}) | hands
     if problem.second is not None:
-        data["second"] = _section(SecondSection, problem.second)
-    for name, section, phase in (
-        ("swing", SwingSection, problem.swing),
-        ("follow", FollowSection, problem.follow),
-    ):
+        data["second"] = _section("second", problem.second)
+    for name, phase in (("swing", problem.swing), ("follow", problem.follow)):
         if phase != factories[name]():
-            data[name] = _section(section, phase)
+            data[name] = _section(name, phase)
     elements = dict(zip(ELEMENTS, problem.collision_elements, strict=True))
-    for name, part in (("collision", CollisionSection), ("objective", ObjectiveSection)):
+    for name in ("collision", "objective"):
+        part = _kind(name)
         values = {key: elements.get(key, getattr(problem, key, None)) for key in part.model_fields}
         data[name] = _different(part, values)
-    data["scenarios"] = [_section(ScenarioSection, scenario) for scenario in problem.scenarios]
+    data["scenarios"] = [_section("scenarios", scenario) for scenario in problem.scenarios]
     if problem.objectives != ImpactProblem.objectives:
-        data["objectives"] = _parts(ObjectiveSections, problem.objectives)
-    data["terms"] = _parts(TermSections, [term for term in problem.terms if term not in DEFAULT_TERMS])
+        data["objectives"] = _parts(_kind("objectives"), problem.objectives)
+    data["terms"] = _parts(_kind("terms"), [term for term in problem.terms if term not in DEFAULT_TERMS])
     if problem.body != TargetBody():
-        data["target"]["body"] = _section(Body, problem.body)
-    data["obstacles"] = [_section(ObstacleSection, obstacle) for obstacle in problem.obstacles]
+        data["target"]["body"] = section_data(Body, problem.body)
+    data["obstacles"] = [_section("obstacles", obstacle) for obstacle in problem.obstacles]
     if problem.friction is not None:
-        data["friction"] = {"coefficient": problem.friction.coefficient} | _section(
-            FrictionSection, problem.friction
-        )
+        friction = _section("friction", problem.friction)
+        data["friction"] = {"coefficient": problem.friction.coefficient} | friction
     if problem.ground is not None:
-        data["ground"] = {"height_m": 0.0} | _section(GroundSection, problem.ground)
+        data["ground"] = {"height_m": 0.0} | _section("ground", problem.ground)
     order = ["problem", *(name for name in File.model_fields if name != "problem")]
     return {name: data[name] for name in order if data.get(name)}
+
+
+def _kind(name: str) -> Any:
+    """The class of a file's section, by its name."""
+    return section_in(File.model_fields[name].annotation)
+
+
+def _section(name: str, thing: Any, without: Sequence[str] = ()) -> dict[str, Any]:
+    """`section_data` of a file's section, by its name."""
+    return section_data(_kind(name), thing, without)
 
 
 def _parts(section: type[Section], things: Any) -> dict[str, Any]:
@@ -329,7 +280,7 @@ def _parts(section: type[Section], things: Any) -> dict[str, Any]:
                 f"the problem cannot be written to a file, which has no section for {type(thing).__name__}"
             )
         name, part = kinds[type(thing)]
-        out[name] = _section(part, thing)
+        out[name] = section_data(part, thing)
     return {name: out[name] for name in section.model_fields if name in out}
 
 
@@ -351,10 +302,10 @@ def _of_kind(what: str, thing: Any, kinds: Mapping[str, type[Section]], key: str
             f"{type(thing).__name__} is a class in Python"
         )
     name = names[type(thing)]
-    return {**({} if name == next(iter(kinds)) else {key: name}), **_section(kinds[name], thing)}
+    return {**({} if name == next(iter(kinds)) else {key: name}), **section_data(kinds[name], thing)}
 
 
-def _section(section: type[Section], thing: Any, without: Sequence[str] = ()) -> dict[str, Any]:
+def section_data(section: type[Section], thing: Any, without: Sequence[str] = ()) -> dict[str, Any]:
     """Data of the section of a thing, without defaults; without : keys that the thing does not have."""
     left_out = (section.choice, *section.apart, *without)
     names = [name for name in section.model_fields if name not in left_out]

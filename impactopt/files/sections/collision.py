@@ -43,11 +43,8 @@ from impactopt.problem.scenario import Phase
 from impactopt.problem.stances import StancePhase, impact_phase, phase_coordinates, stance_at_impact
 from impactopt.robots.robot import Robot
 
-_FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # defaults
 TargetKind: Any = one_of(kind.word for kind in targets.TARGETS)
 LawKind: Any = one_of(kind.word for kind in laws.LAWS)
-
-
 Body: Any = section_of(TargetBody)
 
 
@@ -57,7 +54,9 @@ class Target(Section):
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "target_kind"
     apart: ClassVar[tuple[str, ...]] = ("body",)
-    target_kind: TargetKind = Field(default=_FIRST_TARGET, alias="kind", description="kind of target")
+    target_kind: TargetKind = Field(
+        default=targets.TARGETS[0].word, alias="kind", description="kind of target"
+    )
     body: Body = optional("")
 
 
@@ -72,7 +71,7 @@ class Contact(Section):
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "law"
-    law: LawKind = Field(default=_FIRST_LAW, description="contact law")
+    law: LawKind = Field(default=laws.LAWS[0].word, description="contact law")
 
 
 class _KnownContact(Contact):
@@ -89,11 +88,9 @@ AnyFile = TypeVar("AnyFile", bound=Section)
 
 def with_kinds(file: type[AnyFile], data: Mapping[str, Any]) -> type[AnyFile]:
     """The model of a file, with [target] and [contact] of the kinds in its data."""
-    found = {
-        "target": _section_of_kind(data, "target", "kind", TARGETS, Target, _FIRST_TARGET),
-        "contact": _section_of_kind(data, "contact", "law", LAWS, Contact, _FIRST_LAW),
-    }
-    return cast(type[AnyFile], _file_with(file, found["target"], found["contact"]))
+    target = _section_of_kind(data.get("target"), Target, TARGETS)
+    contact = _section_of_kind(data.get("contact"), Contact, LAWS)
+    return cast(type[AnyFile], _file_with(file, target, contact))
 
 
 @cache  # a sweep reads thousands of files
@@ -102,17 +99,13 @@ def _file_with(file: type[Section], target: type[Section], contact: type[Section
     return create_model(file.__name__, __base__=file, **fields)
 
 
-def _section_of_kind(
-    data: Mapping[str, Any],
-    section: str,
-    key: str,
-    kinds: Mapping[str, type[Section]],
-    unknown: type[Section],
-    default: str,
-) -> type[Section]:
-    given = data.get(section)
-    name = given.get(key, default) if isinstance(given, Mapping) else default
-    return kinds.get(name, unknown) if isinstance(name, str) else unknown
+def _section_of_kind(given: Any, unknown: type[Section], kinds: Mapping[str, type[Section]]) -> type[Section]:
+    """The section of the kind that is given, or of the default; `unknown` for another word."""
+    choice = unknown.model_fields[unknown.choice]
+    word = choice.default
+    if isinstance(given, Mapping):
+        word = given.get(choice.alias or unknown.choice, word)
+    return kinds.get(word, unknown) if isinstance(word, str) else unknown
 
 
 class ProblemSection(Section):

@@ -124,18 +124,23 @@ def _mistake(model: type[BaseModel], e: Mapping[str, Any]) -> Mistake:
     return Mistake(place=e["loc"], sections=sections, text=text)
 
 
+def section_in(annotation: Any) -> Any:
+    """Model of a section in a type annotation, also of the entries of a list or a table; None for others."""
+    kinds = (kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type))
+    return next((kind for kind in kinds if issubclass(kind, BaseModel)), None)
+
+
 def section_at(model: type[BaseModel], place: Place) -> tuple[type[BaseModel], int]:
     """Model of the innermost table that contains `place`, and how many of the place's parts name it."""
     depth = 0
     while depth < len(place):
         fields: dict[str | int, Any] = {_key(model, name): info for name, info in model.model_fields.items()}
         annotation = fields[place[depth]].annotation if place[depth] in fields else None
-        inner = [kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type)]
-        inner = [kind for kind in inner if issubclass(kind, BaseModel)]
+        inner = section_in(annotation)
         by_name = get_origin(annotation) is dict
-        if not inner or (by_name and depth + 1 == len(place)):
+        if inner is None or (by_name and depth + 1 == len(place)):
             break
-        model, depth = inner[0], depth + 1
+        model, depth = inner, depth + 1
         if depth < len(place) and (isinstance(place[depth], int) or by_name):
             depth += 1
     return model, depth

@@ -20,7 +20,7 @@ from impactopt.codegen.files import read_plain
 from impactopt.errors import MANY, InputError, did_you_mean, shortened
 from impactopt.files.named_problems import problem_file
 from impactopt.files.sections.collision import CollisionSections, with_kinds
-from impactopt.files.sections.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
+from impactopt.files.sections.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes, section_in
 from impactopt.files.sections.values import Section
 from impactopt.files.toml import (
     LONGEST_TEXT,
@@ -67,7 +67,7 @@ class CollisionFile:
         InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
         """
         path = problem_file(path)
-        return cls.parse(_read(path), path, settings)
+        return cls.parse(read_text(path), path, settings)
 
     @classmethod
     def parse(cls: type[_F], text: str, path: Path, settings: Mapping[str, Any] | None = None) -> _F:
@@ -249,7 +249,8 @@ def _robot_given_once(data: Mapping[str, Any]) -> list[Mistake]:
     return [Mistake(place=("problem", "robot"), sections=1, text=text)]
 
 
-def _read(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """Text of a TOML file; InputError if there is none, or it cannot be read."""
     try:
         return read_plain(path, LONGEST_TEXT).decode("utf-8-sig")
     except FileNotFoundError as error:
@@ -333,21 +334,16 @@ def _raise(wrong: list[str]) -> None:
 def paths_in(section: type[Section], value: Any, above: str) -> Iterator[str]:
     """Key paths of a section with this value; above : the section's own path, with a dot."""
     for name, info in section.model_fields.items():
-        key, inner = info.alias or name, info.annotation
+        key, inner, form = info.alias or name, section_in(info.annotation), get_origin(info.annotation)
         part = value.get(key) if isinstance(value, Mapping) else None
-        entries = [(f"{above}{key}", part)]
-        if get_origin(inner) is list:
-            (inner,) = get_args(inner)
-            if isinstance(inner, type) and issubclass(inner, Section):
-                entries = [
-                    (f"{above}{key}.{table.get('name', k) if isinstance(table, Mapping) else k}", table)
-                    for k, table in enumerate(part if isinstance(part, list) else ())
-                ]
-        for path, entry in entries:
-            if isinstance(inner, type) and issubclass(inner, Section):
-                yield from paths_in(inner, entry, f"{path}.")
-            else:
-                yield path
+        if inner is None or form is dict:
+            yield f"{above}{key}"
+        elif form is list:
+            for k, table in enumerate(part if isinstance(part, list) else ()):
+                entry = table.get("name", k) if isinstance(table, Mapping) else k
+                yield from paths_in(inner, table, f"{above}{key}.{entry}.")
+        else:
+            yield from paths_in(inner, part, f"{above}{key}.")
 
 
 def find_key(model: type[Section], data: Mapping[str, Any], key: str) -> Place:

@@ -195,17 +195,13 @@ class RobotSection(Section):
             options["soles"] = [sole.build() for sole in self.soles]
         if "position_limit" in options:
             options["position_limit"] = {j: (a, b) for j, (a, b) in options["position_limit"].items()}
-        strikers = [striker.build() for striker in self.strikers] if options.pop("strikers", None) else []
-        tools = [tool.build() for tool in self.tools] if options.pop("tools", None) else []
-        sections = self.grips if options.pop("grips", None) else {}
-        grips = {name: section.build() for name, section in sections.items()}
-        drives = {
-            joint: section.build()
-            for section in (self.actuators if options.pop("actuators", None) else ())
-            for joint in section.joints
-        }
-        given = self.gains if options.pop("gains", None) else []
-        factors = {joint: g.factor for g in given if not g.open for joint in g.joints}
+        for part in ("strikers", "tools", "grips", "actuators", "gains"):  # are added to the robot below
+            options.pop(part, None)
+        strikers = [striker.build() for striker in self.strikers or ()]
+        tools = [tool.build() for tool in self.tools or ()]
+        grips = {name: section.build() for name, section in (self.grips or {}).items()}
+        drives = {joint: each.build() for each in self.actuators or () for joint in each.joints}
+        factors = {joint: g.factor for g in self.gains or () if not g.open for joint in g.joints}
         kind = next((key for key in ("urdf", "mjcf") if key in options), None)
         if kind is not None:
             read = Robot.from_urdf if kind == "urdf" else Robot.from_mjcf

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.robot_bodies import StrikerFace, striker_face
 from impactopt.contact.fields import about
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.terms.hand_orientation import HandOrientation
 from impactopt.problem.violation import degrees, millimetres
-
-if TYPE_CHECKING:
-    from impactopt.kinematics.coordinates import StanceCoordinates
 
 Array = NDArray[np.float64]
 # [s] The constraints hold in this time before contact. Earlier, only the striking point stays behind the

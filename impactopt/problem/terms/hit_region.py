@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -11,14 +11,10 @@ import numpy as np
 from impactopt.bodies.world import face_axes
 from impactopt.contact.fields import about
 from impactopt.errors import InputError, check_array
-from impactopt.kinematics.coordinates import striker_kinematics
+from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import Place, millimetres
-
-if TYPE_CHECKING:
-    from impactopt.kinematics.coordinates import StanceCoordinates
-
 
 REACH = 0.2  # [m] from the hit point to the edge of the largest region
 

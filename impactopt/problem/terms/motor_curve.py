@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impactopt.contact.fields import about
 from impactopt.errors import InputError
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, joint_motion, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import percent
 from impactopt.robots.actuators import numbers_of
-
-if TYPE_CHECKING:
-    from impactopt.kinematics.coordinates import StanceCoordinates
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import product
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impactopt.contact.fields import about
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, joint_motion, make_block
 from impactopt.problem.terms.base import Term, of_joints
 from impactopt.problem.violation import Measure
 from impactopt.robots.actuators import numbers_of
-
-if TYPE_CHECKING:
-    from impactopt.kinematics.coordinates import StanceCoordinates
 
 # Signs of the servo's power and of the power of Coulomb friction: as neither |torque x speed| nor |speed| is
 # smooth, each combination is a constraint.

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impactopt.contact.fields import about
-from impactopt.kinematics.coordinates import striker_kinematics
+from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
 from impactopt.kinematics.operational_space import across
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import millimetres
-
-if TYPE_CHECKING:
-    from impactopt.kinematics.coordinates import StanceCoordinates
 
 
 @dataclass(frozen=True, kw_only=True)

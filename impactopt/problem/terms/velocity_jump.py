@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impactopt.contact.fields import about
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, joint_motion, make_block
 from impactopt.problem.terms.base import Term, of_joints
 from impactopt.problem.violation import Measure
-
-if TYPE_CHECKING:
-    from impactopt.kinematics.coordinates import StanceCoordinates
 
 
 @dataclass(frozen=True, kw_only=True)

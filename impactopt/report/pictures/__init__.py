@@ -14,36 +14,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from impactopt.errors import InputError, check_choice, check_kind
-from impactopt.files.output import record_of, write_file
+from impactopt.files.output import record_of, remove_file, write_file
 from impactopt.files.record import Record
 from impactopt.planning.solution import Solution
-from impactopt.report.pictures.ellipsoid import ellipsoid
-from impactopt.report.pictures.force import draw_force, force
-from impactopt.report.pictures.hierarchy import hierarchy
-from impactopt.report.pictures.iterations import iterations
-from impactopt.report.pictures.motion import motion
-from impactopt.report.pictures.overview import overview
+from impactopt.report.pictures.ellipsoid import ellipsoid as ellipsoid
+from impactopt.report.pictures.force import draw_force
+from impactopt.report.pictures.force import force as force
+from impactopt.report.pictures.hierarchy import hierarchy as hierarchy
+from impactopt.report.pictures.iterations import iterations as iterations
+from impactopt.report.pictures.motion import motion as motion
+from impactopt.report.pictures.overview import overview as overview
 from impactopt.report.pictures.replay import replay as _replay
-from impactopt.report.pictures.strobe import strobe
-from impactopt.report.pictures.style import Picture, RecordPicture, styled
-from impactopt.report.pictures.torque import torque
-from impactopt.report.pictures.zmp import zero_moment_point
-
-__all__ = [
-    "PICTURES",
-    "Picture",
-    "ellipsoid",
-    "force",
-    "hierarchy",
-    "iterations",
-    "motion",
-    "overview",
-    "plot",
-    "save_pictures",
-    "strobe",
-    "torque",
-    "zero_moment_point",
-]
+from impactopt.report.pictures.strobe import strobe as strobe
+from impactopt.report.pictures.style import Picture as Picture
+from impactopt.report.pictures.style import RecordPicture, styled
+from impactopt.report.pictures.torque import torque as torque
+from impactopt.report.pictures.zmp import zero_moment_point as zero_moment_point
 
 # by file name without .png
 PICTURES: Mapping[str, RecordPicture] = {
@@ -129,7 +115,7 @@ def save_pictures(record: Record, directory: Path, names: Iterable[str] = tuple(
         path = directory / f"{name}.png"
         picture = PICTURES[name](record) if record.completed else None
         if picture is None:
-            path.unlink(missing_ok=True)
+            remove_file(path)
             continue
         write_file(path, picture.write)
         written.append(path)

@@ -7,20 +7,9 @@ from matplotlib.figure import FigureBase
 from matplotlib.lines import Line2D
 
 from impactopt.files.record import Record
-from impactopt.report.pictures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    joint_label,
-    picture,
-    title,
-)
+from impactopt.report.pictures.style import BLACK, COLOURS, joint_label, picture, title
 
-COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
+JOINT_COLOURS = COLOURS[:-1]  # the last one is black, of the simulation
 
 
 @picture(height=4.6)
@@ -29,10 +18,10 @@ def motion(figure: FigureBase, record: Record) -> None:
     a = record.arrays
     names, time, angle = a["joints"], a["reference_time"], a["reference_angle"]
     until = float(a["reference_end"])
-    chosen = np.argsort(-np.ptp(angle, axis=0))[: len(COLOURS)]
+    chosen = np.argsort(-np.ptp(angle, axis=0))[: len(JOINT_COLOURS)]
     rate = a["reference_v"][:, -len(names) :] / a["velocity_limit"]
     top, bottom = figure.subplots(2, 1, sharex=True)
-    for j, colour in zip(chosen, COLOURS, strict=False):
+    for j, colour in zip(chosen, JOINT_COLOURS, strict=False):
         top.plot(time, angle[:, j], color=colour, label=joint_label(names[j]))
         bottom.plot(time, rate[:, j], color=colour)
         if record.simulated:

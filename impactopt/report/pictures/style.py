@@ -22,15 +22,9 @@ Array = NDArray[np.float64]
 Given = ParamSpec("Given")
 Drawn = TypeVar("Drawn")
 
-BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#CC79A7",
-    "#56B4E9",
-    "#000000",
-)
+# in the order in which lines get them
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
+BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK = COLOURS
 
 # of collision models, in all pictures
 MODELS = {
@@ -58,7 +52,7 @@ STYLE: Any = {
     "figure.constrained_layout.use": True,
     "font.size": 8,
     "axes.titlesize": 9,
-    "axes.prop_cycle": cycler(color=[BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK]),
+    "axes.prop_cycle": cycler(color=COLOURS),
     "figure.titlesize": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -172,13 +166,17 @@ def joint_label(name: object) -> str:
     return str(name).removesuffix("_joint").replace("_", " ")
 
 
-def simulated_phases(record: Record) -> NDArray[np.intp]:
-    """Phase of the simulated instants (k,): 0 before, 1 in, 2 after contact.
+def simulated_parts(record: Record, values: Array) -> list[tuple[Array, Array]]:
+    """Times ([s]; [ms] since contact in the collision) and values (k, ...) of the simulation's three phases.
 
     Without a simulated contact, the phases are those of the plan.
     """
     a = record.arrays
     kind = "simulated" if np.isfinite(a["simulated_contact_start"]) else "reference"
     start, end = (float(a[f"{kind}_contact_{which}"]) for which in ("start", "end"))
+    time = a["simulated_time"]
     # nan, for a contact that did not end, compares false
-    return (a["simulated_time"] >= start).astype(int) + (a["simulated_time"] >= end).astype(int)
+    phase = (time >= start).astype(int) + (time >= end).astype(int)
+    before, contact, after = (time[phase == k] for k in range(3))
+    times = (before, 1e3 * (contact - contact[:1]), after)
+    return [(times[k], values[phase == k]) for k in range(3)]

@@ -16,19 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.files.output import write_file
-from impactopt.report.pictures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PAGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    Picture,
-    model_colour,
-    styled,
-)
+from impactopt.report.pictures.style import BLACK, COLOURS, PAGE, Picture, model_colour, styled
 from impactopt.report.pictures.sweep_columns import (
     Columns,
     SweepColumns,
@@ -42,7 +30,6 @@ from impactopt.sweeps.table import read_columns, read_units
 
 Array = NDArray[np.float64]
 
-COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
 NO_RESULT = "#d9d9d9"  # colour of cases without a result
 MAX_MARKED = 25  # points of a line that are marked; longer lines have no marks

@@ -18,7 +18,7 @@ from impactopt.report.pictures.style import (
     Array,
     joint_label,
     picture,
-    simulated_phases,
+    simulated_parts,
 )
 
 JOINT_HEIGHT = 0.13  # [in]
@@ -114,17 +114,12 @@ def draw_torque(figure: FigureBase, record: Record) -> None:
 def _demand(record: Record) -> list[tuple[Array, Array]]:
     """Times and |demand| / limit (k, n) of the three phases."""
     a = record.arrays
-    if not record.simulated:
-        parts = [a["reference_phase"] == k for k in range(3)]
-        torques = [a["reference_torque"][parts[0]], a["collision_torque"], a["reference_torque"][parts[2]]]
-        times = [a["reference_time"][parts[0]], 1e3 * a["collision_time"], a["reference_time"][parts[2]]]
-    else:
-        phase = simulated_phases(record)
-        torques = [a["simulated_demand"][phase == k] for k in range(3)]
-        times = [a["simulated_time"][phase == k] for k in range(3)]
-        times[1] = 1e3 * (times[1] - times[1][:1])
-    ratios = [np.abs(values) / a["torque_limit"] for values in torques]
-    return list(zip(times, ratios, strict=True))
+    if record.simulated:
+        return simulated_parts(record, np.abs(a["simulated_demand"]) / a["torque_limit"])
+    torque, time, phase = a["reference_torque"], a["reference_time"], a["reference_phase"]
+    histories = [(time[phase == k], torque[phase == k]) for k in range(3)]
+    histories[1] = 1e3 * a["collision_time"], a["collision_torque"]
+    return [(time, np.abs(values) / a["torque_limit"]) for time, values in histories]
 
 
 def _binned(time: Array, values: Array, most: int = 500) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from impactopt.files.record import Record
 from impactopt.kinematics.support import zmp
 from impactopt.report.histories import footprints
-from impactopt.report.pictures.style import BLACK, OVER, PHASES, RIGHT, Array, picture, simulated_phases
+from impactopt.report.pictures.style import BLACK, OVER, PHASES, RIGHT, Array, picture, simulated_parts
 
 
 @picture(
@@ -81,12 +81,9 @@ def _zmp_paths(record: Record) -> dict[tuple[str, int], tuple[Array, Array]]:
     if len(a["collision_ground"]):  # no path of an impact without duration
         out["planned", 1] = 1e3 * a["collision_time"][1:], zmp(a["collision_ground"])
     if record.simulated:
-        time, phase = a["simulated_time"], simulated_phases(record)
-        for k in range(3):
-            keep = phase == k
-            if keep.any():
-                shown = 1e3 * (time[keep] - time[keep][0]) if k == 1 else time[keep]
-                out["simulated", k] = shown, zmp(a["simulated_sole_ground"][keep].sum(axis=1))
+        for k, (time, wrench) in enumerate(simulated_parts(record, a["simulated_sole_ground"].sum(axis=1))):
+            if len(time):
+                out["simulated", k] = time, zmp(wrench)
     return out
 
 

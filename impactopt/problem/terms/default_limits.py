@@ -1,0 +1,216 @@
+"""Default terms whose constraints the transcription adds: limits of joints, soles, the impact and bodies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from impactopt.contact.fields import about
+from impactopt.errors import InputError
+from impactopt.problem.terms.base import Term
+from impactopt.problem.violation import degrees
+from impactopt.robots.robot import Robot
+from impactopt.robots.tools import inside
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueLimit(Term):
+    """|torque| is at most a fraction of each joint's limit; the servo has the rest for its feedback."""
+
+    name: ClassVar[str] = "torque limit"
+    unit: ClassVar[str] = "of limit"
+    fraction: float = field(
+        default=0.85,
+        metadata=about("share of the limit in swing and follow-through", above=0, most=1),
+    )
+    collision: float = field(default=0.85, metadata=about("share of the limit in contact", above=0, most=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class VelocityLimit(Term):
+    """|joint velocity| is at most a fraction of each joint's limit.
+
+    The bounds are on the spline's velocity control points, so they hold everywhere; those of the legs are at
+    the nodes.
+    """
+
+    name: ClassVar[str] = "velocity limit"
+    unit: ClassVar[str] = "of limit"
+    fraction: float = field(default=0.95, metadata=about("share of the limit", above=0, most=1))
+
+    def most(self, robot: Robot) -> Any:
+        """Largest magnitude (n,) of each joint's velocity [rad/s] or [m/s]."""
+        return self.fraction * robot.velocity_limit
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionLimit(Term):
+    """Joints stay inside their limits of position.
+
+    The bounds are on the spline's control points, so they hold everywhere; those of legs and tendons are at
+    the nodes. The margin of tendons and of hinges of soles, whose range may be small, is at most a quarter of
+    it.
+    """
+
+    name: ClassVar[str] = "position limit"
+    unit: ClassVar[str] = "rad"
+    margin: float = field(default=0.02, metadata=about("distance from each limit", unit="rad", least=0))
+
+    def add_constraints(self, program: Any) -> None:
+        """Add the constraints of the tendons; joints have bounds of variables."""
+        c, own = program.coordinates, program.robot.ranges
+        lower, upper = (limit[program.robot.n :] for limit in inside(program.robot, self.margin))
+        if not lower.size:
+            return
+        # tendon lengths are of_y @ y + (matrix of the legs) @ legs
+        of_y = np.pad(own.matrix[:, c.independent], ((0, 0), (c.base, 0)))
+        for place, (y, legs) in program.body_spots:
+            program.constraints.add(
+                term=self.name,
+                place=place,
+                components=own.names[program.robot.n :],
+                affine=y.apply(of_y) + legs.apply(own.matrix[:, c.dependent]),
+                lower=lower,
+                upper=upper,
+                measure=degrees("outside"),
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactWrenchCone(Term):
+    """Each sole's wrench lies in the cone of its corners: centre of pressure, friction and torsion.
+
+    Source: Caron et al. 2015, see :mod:`impactopt.kinematics.support`. The cone bounds friction, centre
+    of pressure and yaw torsion of each sole together: where friction or pressure use it up, less torsion is
+    left. So there are no terms for one of them alone.
+    """
+
+    name: ClassVar[str] = "contact wrench cone"
+    unit: ClassVar[str] = "of weight"
+    friction: float = field(
+        default=0.6,
+        metadata=about("friction coefficient that the plan may use along each axis of the sole", above=0),
+    )
+    margin: float = field(
+        default=0.02,
+        metadata=about("least distance from the centre of pressure to the sole's edges", unit="m", least=0),
+    )
+    collision_margin: float | None = field(
+        default=0.02,
+        metadata=about(
+            'the same in contact; "anywhere": no constraint',
+            unit="m",
+            least=0,
+            none="anywhere",
+        ),
+    )
+    minimum_force: float = field(
+        default=50.0, metadata=about("least normal force of each sole", unit="N", least=0)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Balance(Term):
+    """Bounds on the state after the impact, so that the robot does not fall; inf: no bound."""
+
+    name: ClassVar[str] = "balance after impact"
+    unit: ClassVar[str] = "m, m/s, N m s"
+    capture_margin: float | None = field(
+        default=0.02,
+        metadata=about(
+            'margin of the capture point in the support polygon; "anywhere": no constraint',
+            unit="m",
+            least=0,
+            none="anywhere",
+        ),
+    )
+    vertical_speed: float = field(
+        default=0.2,
+        metadata=about("largest vertical speed of the centre of mass", unit="m/s", least=0, endless=True),
+    )
+    angular_momentum: float = field(
+        default=10.0,
+        metadata=about(
+            "largest angular momentum about each axis; inf: any",
+            unit="N m s",
+            least=0,
+            endless=True,
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        if isinstance(self.capture_margin, float) and self.capture_margin == np.inf:
+            raise InputError("Balance.capture_margin is inf, which nothing can keep; give None for anywhere")
+        super().__post_init__()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Incidence(Term):
+    """The striking point's speed across the normal at contact is bounded, so that it does not glance off.
+
+    :class:`impactopt.HitCone` replaces it.
+    """
+
+    name: ClassVar[str] = "incidence"
+    unit: ClassVar[str] = "m/s"
+    speed: float = field(
+        default=0.05,
+        metadata=about(
+            "largest speed along each of two tangents; inf: any", unit="m/s", least=0, endless=True
+        ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LegExtension(Term):
+    """The knees of standing legs stay bent.
+
+    At the nodes of swing and follow-through, the determinant of the leg's Jacobian (from joints to sole) over
+    its value in the start posture has a lower bound. Near a straight knee the joint rates that keep the sole
+    in place grow without bound, and the leg could become too short between two nodes: at 0.35 TALOS has 7 mm
+    left.
+    """
+
+    name: ClassVar[str] = "leg extension"
+    unit: ClassVar[str] = "of start"
+    minimum: float = field(
+        default=0.35,
+        metadata=about(
+            "least determinant of the leg's Jacobian over that at the start",
+            least=0,
+            most=1,
+        ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfCollision(Term):
+    """Links of the robot have clearance, except where a joint connects them or they touch at the start
+    (neighbours: start within 2 mm).
+
+    It is required from start to rest, after a miss too. Other links that are nearer than the margin at
+    the start may stay so near.
+    """
+
+    name: ClassVar[str] = "self-collision"
+    unit: ClassVar[str] = "m"
+    margin: float = field(default=0.01, metadata=about("least distance between two links", unit="m", least=0))
+    enabled: bool = field(default=True, metadata=about("false: links may pass through each other"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeepOut(Term):
+    """The robot has clearance from target, ground and obstacles; the striking link may touch the target's
+    face.
+
+    Fixed soles stand on the ground.
+    """
+
+    name: ClassVar[str] = "keep out"
+    unit: ClassVar[str] = "m"
+    margin: float = field(
+        default=0.01, metadata=about("least distance from a link to any of them", unit="m", least=0)
+    )
+    enabled: bool = field(default=True, metadata=about("false: the robot may pass through them"))

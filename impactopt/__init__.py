@@ -54,7 +54,7 @@ _EXPORTS = {
     "VirtualMass": "collision",
     "animate": "report.animation",
     "arm7": "robots.presets",
-    "coasting_reference": "collision.coasting",
+    "coasting_reference": "collision.settings",
     "collide_many": "sweeps.collisions",
     "draw_perturbations": "simulation.robustness",
     "drive_nail": "api",

@@ -33,7 +33,7 @@ from impactopt.files.record import (
     read_json,
 )
 from impactopt.files.toml import read_toml, write_toml
-from impactopt.kinematics.support import corners_at, support_polygon
+from impactopt.kinematics.stance import corners_at, support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
 from impactopt.simulation.result import Simulation, state_at_contact

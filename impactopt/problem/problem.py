@@ -38,8 +38,7 @@ from impactopt.errors import (
 )
 from impactopt.kinematics.coordinates import MAX_START_PITCH, StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
-from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance, support_polygon
 from impactopt.problem.checks import (
     COLLISIONS,
     INSTANT,

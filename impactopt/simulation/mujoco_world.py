@@ -19,7 +19,7 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
-from impactopt.simulation.sliding_points import SlidingPoints
+from impactopt.simulation.target_dynamics import SlidingPoints
 
 Array = NDArray[np.float64]
 # hardest equality that MuJoCo accepts: impedance, and time constant in steps

@@ -24,8 +24,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.robots.couplings import Axis, axis_of
 from impactopt.robots.robot import Robot
-from impactopt.transcription.batched import Block
-from impactopt.transcription.builder import Builder
+from impactopt.transcription.builder import Block, Builder
 from impactopt.transcription.layout import Affine, Array, ConstraintOrigin, Index, Place, millimetres, stack
 
 TOO_NEAR = millimetres("too near")

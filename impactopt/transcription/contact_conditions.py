@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from impactopt.kinematics.operational_space import across, striking_point
-from impactopt.kinematics.support import inward_edges, support_polygon
+from impactopt.kinematics.stance import inward_edges, support_polygon
 from impactopt.problem.objectives import AngularMomentum
 from impactopt.problem.terms import HitCone, HitRegion, TargetSpeed
 from impactopt.transcription.builder import Builder

@@ -18,8 +18,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.problem.terms.base import kind_of
 from impactopt.solvers.program import Determined
-from impactopt.transcription.batched import Block
-from impactopt.transcription.builder import Builder
+from impactopt.transcription.builder import Block, Builder
 from impactopt.transcription.clearance import (
     ClearanceKey,
     SeparatingDirection,

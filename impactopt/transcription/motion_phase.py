@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.kinematics.splines import CubicSpline, basis, graded_breaks, knots, rate_weights
-from impactopt.kinematics.support import contact_wrench_cone
+from impactopt.kinematics.stance import contact_wrench_cone
 from impactopt.problem.problem import Phase
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder

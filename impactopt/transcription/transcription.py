@@ -21,7 +21,7 @@ import numpy as np
 from impactopt.codegen.cache import FunctionGroup, cached_groups, model_hash
 from impactopt.contact.friction import moves_target
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import support_polygon
 from impactopt.problem.block import BlockExpression
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined

@@ -25,8 +25,7 @@ from impactopt import (
     solve,
 )
 from impactopt.bodies.clearance import Places
-from impactopt.planning import between_nodes
-from impactopt.planning.between_nodes import BetweenNodes
+from impactopt.planning import oracles
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import (
     Margins,
@@ -35,6 +34,7 @@ from impactopt.planning.clearance_constraints import (
     node_placements,
     same_bodies,
 )
+from impactopt.planning.oracles import BetweenNodes
 from impactopt.planning.refinement import Evaluation, Guess, Outcome
 from impactopt.planning.solve import PlanSolver
 from impactopt.solvers.program import max_violation
@@ -168,10 +168,10 @@ def test_rounds_end_with_bodies_that_are_apart(
     warm : the solutions' multipliers lead to the next one; else these guesses fail, and others follow.
     """
     if not warm:
-        monkeypatch.setattr(between_nodes, "_ITERATIONS_WARM", 5)
+        monkeypatch.setattr(oracles, "_ITERATIONS_WARM", 5)
     first, last = free.plan.swing_nodes[interval : interval + 2] * free.plan.swing.duration
     x, _, z = hammer(free, 0.35 * first + 0.65 * last)
-    problem, began, solved = with_peg(free.problem, x, z), list[float](), between_nodes.solve_with_clearance
+    problem, began, solved = with_peg(free.problem, x, z), list[float](), oracles.solve_with_clearance
 
     def watched(budget: Budget, margins: Margins, guess: Guess[Transcription]) -> Outcome[Transcription]:
         t = guess.program
@@ -179,7 +179,7 @@ def test_rounds_end_with_bodies_that_are_apart(
         began.append(violation(t.with_clearance(rows), guess.x))
         return solved(budget, margins, guess)
 
-    monkeypatch.setattr(between_nodes, "solve_with_clearance", watched)
+    monkeypatch.setattr(oracles, "solve_with_clearance", watched)
     solution = solve(problem)
     assert solution.status is Status.SOLVED and solution.nodes.total > 0
     assert solution.clearance()["clearance_mm"] > 0 and not solution.clearance()["contacts_besides"]

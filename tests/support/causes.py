@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from impactopt import ImpactProblem
 from impactopt.planning.budget import Budget
-from impactopt.planning.causes import Search, search
 from impactopt.planning.clearance_constraints import Margins, Watch
+from impactopt.planning.diagnosis import Search, search
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription, block_functions

@@ -28,7 +28,7 @@ from impactopt import (
     VelocityLimit,
 )
 from impactopt.kinematics.splines import Radau
-from impactopt.kinematics.support import contact_wrench_cone, zmp
+from impactopt.kinematics.stance import contact_wrench_cone, zmp
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import check_program
 from impactopt.transcription.contact_conditions import rotation_rows

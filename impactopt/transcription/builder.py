@@ -233,16 +233,7 @@ class Builder:
         group = self.layout.add(
             name, 1, size, lower=lower, upper=upper, scale=scale, labels=labels, measure=measure
         )
-        self.constraints.add(
-            term=term or name,
-            place=place,
-            components=labels,
-            outputs=outputs,
-            affine=-group[0],
-            lower=0,
-            upper=0,
-            measure=measure,
-        )
+        self.equal(term or name, place, labels, outputs, measure, affine=-group[0])
         # in the order of their making, as an output may depend on variables lifted before (`with_lifted`)
         self.lifted.append((group, np.asarray(outputs, dtype=np.intp)))
         return group
@@ -252,15 +243,18 @@ class Builder:
         term: str,
         place: Place | str,
         components: Sequence[str],
-        outputs: Any,
+        outputs: Any = None,
         measure: Measure | Sequence[Measure] | None = None,
+        *,
+        affine: Affine | None = None,
     ) -> None:
-        """Constrain outputs of blocks to zero."""
+        """Constrain outputs of blocks, affine expressions, or the sums of both, to zero."""
         self.constraints.add(
             term=term,
             place=place,
             components=components,
             outputs=outputs,
+            affine=affine,
             lower=0,
             upper=0,
             measure=measure,

@@ -562,15 +562,7 @@ class Collision(ContactParameters):
             integral = integral - rate[m] * w
         if not s.new_phase:
             integral = integral - integrals[s.previous]
-        self._b.constraints.add(
-            term="collision kinematics",
-            place=place,
-            components=labels,
-            affine=integral,
-            lower=0,
-            upper=0,
-            measure=rates(labels),
-        )
+        self._b.equal("collision kinematics", place, labels, measure=rates(labels), affine=integral)
 
     # ------------------------------------------------------------------ constraints
     def add_constraints(self, at: dict[str, tuple[int, int]]) -> None:

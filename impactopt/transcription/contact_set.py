@@ -116,15 +116,13 @@ class ContactSet:
 
     def add_feedforward_constraints(self, torque: Index) -> None:
         """Constrain the feed-forward to the torque at the node at contact, whose outputs (n,) are given."""
-        self._b.constraints.add(
-            term="feed-forward that makes the robot coast",
-            place="contact",
-            components=self._b.robot.joint_names,
-            outputs=torque,
+        self._b.equal(
+            "feed-forward that makes the robot coast",
+            "contact",
+            self._b.robot.joint_names,
+            torque,
+            percent("of the joint's limit off"),
             affine=-self.contact.feedforward[0],
-            lower=0,
-            upper=0,
-            measure=percent("of the joint's limit off"),
         )
 
     def update_parameters(self, *, anew: bool) -> None:

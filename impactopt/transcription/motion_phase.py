@@ -381,15 +381,13 @@ class MotionPhase:
         # the block divides by the weight, m * GRAVITY
         gravity = np.append(np.array(b.robot.model.gravity.linear) / GRAVITY, np.zeros(3))
         for s, out in list(zip(fractions, outputs, strict=True))[len(start) :]:
-            b.constraints.add(
-                term="momentum",
-                place=self.place_at(s),
-                components=DIRECTIONS,
-                outputs=out,
+            b.equal(
+                "momentum",
+                self.place_at(s),
+                DIRECTIONS,
+                out,
+                measure,
                 affine=-initial - stack([self.T[0]] * 6) * (s * gravity),
-                lower=0,
-                upper=0,
-                measure=measure,
             )
 
     # ------------------------------------------------------------------ numbers

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -26,9 +26,9 @@ from impactopt.robots.build import (
     set_velocity_limit,
     velocity_limit,
 )
+from impactopt.robots.model import MIMIC, axis_of
 
 Array = NDArray[np.float64]
-_MIMIC = "JointModelMimic"
 
 
 class Coupling(NamedTuple):
@@ -39,35 +39,12 @@ class Coupling(NamedTuple):
     offset: float
 
 
-class Axis(NamedTuple):
-    """Placement and axis of a joint, at zero of its coordinate.
-
-    placement : pin.SE3 in the parent's frame.  subspace (6,) : unit twist [linear; angular] of the joint.
-    ratio : derivative of the joint's angle by its coordinate; 1 unless it is a follower.
-    """
-
-    placement: Any
-    subspace: Array
-    ratio: float
-
-
-def axis_of(model: pin.Model, joint: int) -> Axis:
-    """Axis of a joint with one degree of freedom, or of a follower."""
-    kind = model.joints[joint]
-    data, ratio = kind.createData(), 1.0
-    kind.calc(data, pin.neutral(model))
-    if kind.shortname() == _MIMIC:
-        ratio = float(kind.extract().scaling)
-    subspace = np.asarray(data.S, dtype=float).reshape(6) / ratio
-    return Axis(model.jointPlacements[joint] * data.M, subspace, ratio)
-
-
 def couplings_of(model: pin.Model) -> dict[str, Coupling]:
     """Couplings of a model, by the follower's name."""
     leaders = {int(model.joints[j].idx_v): str(model.names[j]) for j in joint_indices(model)}
     out = {}
     for j in range(1, model.njoints):
-        if model.joints[j].shortname() == _MIMIC:
+        if model.joints[j].shortname() == MIMIC:
             kind = model.joints[j].extract()
             leader = leaders[int(model.joints[j].idx_v)]
             out[str(model.names[j])] = Coupling(leader, float(kind.scaling), float(kind.offset))

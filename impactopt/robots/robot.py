@@ -29,8 +29,7 @@ from impactopt.robots.couplings import (
     follower_axes,
     restore_followers,
 )
-from impactopt.robots.forward_kinematics import ForwardKinematics
-from impactopt.robots.model import JointAngles
+from impactopt.robots.model import ForwardKinematics, JointAngles
 from impactopt.robots.tools import check_sole, with_hinges
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]

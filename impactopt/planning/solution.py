@@ -465,8 +465,8 @@ def program_on(
     report: Callable[[str], None] | None = None,
 ) -> Transcription:
     """Program of a problem on a given mesh, without clearance constraints."""
-    functions = block_functions(problem, problem.coordinates, report, elements)
-    return Transcription(problem, problem.coordinates, functions, nodes, elements, shares)
+    functions = block_functions(problem, report, elements)
+    return Transcription(problem, functions, nodes, elements, shares)
 
 
 def program_of(solution: Solution) -> Transcription:

@@ -409,7 +409,7 @@ def _guesses(
     """
     if not isinstance(start, str):
         return [("given", partial(Guess, program=t, start=start))]
-    strike = StrikeTranscription(t.problem, t.coordinates, t.functions) if start == "strike" else None
+    strike = StrikeTranscription(t.problem, t.functions) if start == "strike" else None
 
     def guess(draw: dict[str, Any]) -> Guess[Transcription]:
         if strike is None:

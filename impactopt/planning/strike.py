@@ -193,8 +193,8 @@ def _program_on(
     problem: ImpactProblem, elements: Elements, shares: Shares, report: Callable[[str], None] | None = None
 ) -> StrikeTranscription:
     """Program of a strike on a given mesh of the contact, without clearance constraints."""
-    functions = block_functions(problem, problem.coordinates, report, elements)
-    return StrikeTranscription(problem, problem.coordinates, functions, elements, shares)
+    functions = block_functions(problem, report, elements)
+    return StrikeTranscription(problem, functions, elements, shares)
 
 
 def clear_strike(

@@ -350,12 +350,10 @@ class ExtraBlock:
     user: bool = False
 
 
-def own_blocks(
-    problem: ImpactProblem, c: StanceCoordinates, edges: int = 0
-) -> dict[str, Callable[[], BlockExpression]]:
+def own_blocks(problem: ImpactProblem, edges: int = 0) -> dict[str, Callable[[], BlockExpression]]:
     """Functions that build the blocks which every program of this problem has (`builders`)."""
     return builders(
-        c,
+        problem.coordinates,
         problem.striker,
         problem.law,
         problem.target,
@@ -371,9 +369,7 @@ def own_blocks(
     )
 
 
-def extra_blocks(
-    problem: ImpactProblem, c: StanceCoordinates, elements: Elements = ()
-) -> dict[str, ExtraBlock]:
+def extra_blocks(problem: ImpactProblem, elements: Elements = ()) -> dict[str, ExtraBlock]:
     """Blocks of the problem's objectives and terms, by name.
 
     elements : of the contact; (): the problem's.
@@ -382,13 +378,13 @@ def extra_blocks(
     ------
     InputError : a name that is taken, or is no function's name; something other than a block.
     """
-    taken = {*own_blocks(problem, c)}
+    taken = {*own_blocks(problem)}
     out: dict[str, ExtraBlock] = {}
     sources: list[Term | Objective] = [*problem.objectives, *problem.active_terms]
     # the package's first, so that a name that is taken is reported of the user's class
     for source in sorted(sources, key=lambda s: not type(s).__module__.startswith("impactopt.")):
         where = f"{type(source).__name__}.blocks"
-        made = source.blocks(problem, c)
+        made = source.blocks(problem, problem.coordinates)
         if not isinstance(made, Mapping):
             raise InputError(f"{where} gives {made!r}; give a dict of blocks by name, {{}} for none")
         for name, block in made.items():

@@ -134,9 +134,8 @@ class Builder:
     followers : functions that :meth:`follow` has been given.
     """
 
-    def __init__(
-        self, problem: ImpactProblem, coordinates: StanceCoordinates, functions: dict[str, Any]
-    ) -> None:
+    def __init__(self, problem: ImpactProblem, functions: dict[str, Any]) -> None:
+        coordinates = problem.coordinates
         self.problem, self.coordinates, self.robot = problem, coordinates, problem.robot
         self.functions, self.limits = functions, Limits(problem, coordinates)
         self.ny, self.nl, self.nw = coordinates.ny, coordinates.nl, 6 * len(coordinates.legs)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
@@ -37,12 +36,11 @@ class StrikeTranscription(ContactProgram):
     def __init__(
         self,
         problem: ImpactProblem,
-        coordinates: StanceCoordinates,
         functions: dict[str, Any],
         elements: Elements = (),
         shares: Shares = (),
     ) -> None:
-        b, c = Builder(problem, coordinates, functions), coordinates
+        b, c = Builder(problem, functions), problem.coordinates
         add, limits = b.layout.add, b.limits
         self.y = add("posture at contact", 1, b.ny, **limits.of_y)
         self.legs = add("legs at contact", 1, b.nl, **limits.of_legs)

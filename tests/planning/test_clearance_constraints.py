@@ -58,8 +58,7 @@ def with_peg(problem: ImpactProblem, x: float, z: float) -> ImpactProblem:
 
 
 def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
-    c = problem.coordinates
-    return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_clearance(
+    return Transcription(problem, block_functions(problem), solution.nodes).with_clearance(
         solution.clearance_constraints
     )
 
@@ -146,8 +145,8 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
             rows = {**Watch(t, margins, free.result.x).constraints(), **violated.constraints}
             assert violation(t.with_clearance(rows), free.result.x) > 1e-3
         else:
-            functions = block_functions(problem, problem.coordinates)
-            finer = Transcription(problem, problem.coordinates, functions, violated.nodes)
+            functions = block_functions(problem)
+            finer = Transcription(problem, functions, violated.nodes)
             there, _, _ = warm_start(finer, t, free.result.x, np.zeros(t.program.m), np.zeros(t.layout.n))
             rows = Watch(finer, margins, there).constraints()
             known = set(node_placements(t, free.result.x).names)

@@ -66,7 +66,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def of_strike(t: Transcription) -> StrikeTranscription:
-    return StrikeTranscription(t.problem, t.coordinates, t.functions)
+    return StrikeTranscription(t.problem, t.functions)
 
 
 @pytest.fixture(params=[(robot, kind) for kind in VARIANTS for robot in ("biped", "arm")], ids=", ".join)

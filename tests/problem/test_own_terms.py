@@ -139,7 +139,7 @@ def test_a_block_may_be_named_as_a_function_of_c(arm_transcription: Transcriptio
             return {"floor": height_of(self.frame, coordinates)}
 
     problem = replace(arm_transcription.problem, terms=(Floor(height=1.0),))
-    assert "floor_hess" in block_functions(problem, problem.coordinates)
+    assert "floor_hess" in block_functions(problem)
 
 
 def test_variables_with_a_name_that_is_taken_are_refused(arm_transcription: Transcription) -> None:
@@ -181,7 +181,7 @@ def test_squares_of_variables_are_weighed(arm_transcription: Transcription) -> N
 def test_a_strike_takes_what_says_something_of_it(arm_transcription: Transcription) -> None:
     own = {"terms": (Ceiling(height=2.0),), "objectives": (Impulse(), Strain(weight=1.0))}
     t = changed(arm_transcription, **own)
-    strike = StrikeTranscription(t.problem, t.coordinates, t.functions)
+    strike = StrikeTranscription(t.problem, t.functions)
     assert [o.name for o, _ in strike.objectives] == ["impulse"]
     names = [strike.program.constraint_name(i) for i in range(strike.program.m)]
     assert [name for name in names if name.startswith("ceiling")] == [

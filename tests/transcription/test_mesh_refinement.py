@@ -167,7 +167,7 @@ def finer(t: Transcription) -> Transcription:
     nodes = MoreNodes(
         swing=tuple(middles(t.swing_nodes)[[1, -1]]), follow=tuple(middles(t.follow_nodes)[[0]])
     )
-    return Transcription(t.problem, t.coordinates, t.functions, nodes)
+    return Transcription(t.problem, t.functions, nodes)
 
 
 def test_a_program_with_more_nodes_starts_where_the_old_one_ended(biped_plan: Planned) -> None:

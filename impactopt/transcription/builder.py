@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from impactopt.codegen.batched import BatchedFunction
-from impactopt.contact.friction import moves_target
 from impactopt.errors import InputError, did_you_mean
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
@@ -261,16 +260,6 @@ class Builder:
 
     def parts(self, block: str) -> dict[str, Any]:
         """Indices of the named slices of a block's output, within an instance."""
-        frozen = self.problem.frozen is not None
-        second, friction = self.problem.second is not None, self.problem.friction
-        size = symbolic.sizes(
-            self.coordinates,
-            self.problem.target,
-            block,
-            frozen=frozen,
-            second=second,
-            bristles=friction is not None and friction.bristles,
-            moves_target=moves_target(friction),
-        )
+        size = symbolic.sizes(self.coordinates, self.problem, block)
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}

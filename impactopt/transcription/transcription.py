@@ -185,9 +185,8 @@ class Transcription(ContactProgram):
         add_clearance(b, self.swing, self.follow, self.hit.expected.target_state)
         self.hit.add_constraints()
         self._add_links()
-        if (
-            problem.coordinates.drifts
-        ):  # after the links, whose constraints determine the start of the follow-through
+        # after the links, whose constraints determine the start of the follow-through
+        if problem.coordinates.drifts:
             self.swing.add_momentum_conservation(b)
             self.follow.add_momentum_conservation(b)
         if b.coordinates.legs:

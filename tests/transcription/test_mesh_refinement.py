@@ -38,7 +38,7 @@ from impactopt import (
 )
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
-from impactopt.planning import between_nodes
+from impactopt.planning import oracles
 from impactopt.planning import solution as solutions
 from impactopt.planning.solve import solve
 from impactopt.problem.objectives import OBJECTIVES
@@ -395,5 +395,5 @@ def test_a_plan_that_cannot_be_checked_is_not_lost(coarse: Any, monkeypatch: pyt
     def unreachable(*_: Any) -> MoreNodes:
         raise InputError("a leg does not reach")
 
-    monkeypatch.setattr(between_nodes, "nodes_to_add", unreachable)
+    monkeypatch.setattr(oracles, "nodes_to_add", unreachable)
     assert solve(coarse).status is Status.SOLVED

@@ -73,7 +73,6 @@ def solids_of(problem: ImpactProblem) -> Solids:
                 rotation=body.rotation,
                 of_target=body.of_target,
                 moves=body.moves,
-                before=body.before,
                 strikable=body.strikable,
             )
         )

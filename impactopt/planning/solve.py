@@ -35,13 +35,7 @@ from impactopt.planning.lazy_constraints import (
     with_lazy_constraints,
 )
 from impactopt.planning.models import carried_start, check_start, overloaded, with_order, with_order_of
-from impactopt.planning.multistart import (
-    Guesses,
-    best_of,
-    best_of_starts,
-    check_starts,
-    drawn_guesses,
-)
+from impactopt.planning.multistart import Guesses, best_of, best_of_starts, check_starts, drawn_guesses
 from impactopt.planning.oracles import BetweenNodes, MotionPrice, with_first_scale
 from impactopt.planning.refinement import Guess, Oracle, Outcome, refine
 from impactopt.planning.solution import Solution, program_of, program_on, solution_of

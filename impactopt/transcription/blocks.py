@@ -41,17 +41,6 @@ from impactopt.transcription.contact_blocks import (
 )
 from impactopt.transcription.mesh import Elements, contact_mesh
 
-__all__ = [
-    "BlockExpression",
-    "ExtraBlock",
-    "extra_blocks",
-    "key_of",
-    "make_block",
-    "own_blocks",
-    "sizes",
-    "stance_blocks",
-]
-
 
 def sizes(c: StanceCoordinates, problem: ImpactProblem, block: str) -> dict[str, int]:
     """Lengths of the named slices of a block's output at these coordinates, in order."""

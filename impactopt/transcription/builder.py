@@ -17,19 +17,9 @@ from impactopt.codegen.batched import BatchedFunction
 from impactopt.errors import InputError, did_you_mean
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.violation import Measure, Place
 from impactopt.transcription import blocks as symbolic
-from impactopt.transcription.layout import (
-    Affine,
-    Array,
-    Constraints,
-    Group,
-    Index,
-    Layout,
-    Limits,
-    Measure,
-    Place,
-    stack,
-)
+from impactopt.transcription.layout import Affine, Array, Constraints, Group, Index, Layout, Limits, stack
 
 
 @dataclass

@@ -20,6 +20,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
+from impactopt.problem.violation import Measure, Place, millimetres, percent
 from impactopt.robots.model import mass_matrix
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
@@ -39,14 +40,10 @@ from impactopt.transcription.layout import (
     Array,
     Group,
     Index,
-    Measure,
-    Place,
     Turn,
     along,
     by_leg,
     determined,
-    millimetres,
-    percent,
     rates,
 )
 from impactopt.transcription.mesh import CollocationPoint

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from impactopt.contact.friction import moves_target
+from impactopt.problem.violation import Place, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision, FirstInstant
 from impactopt.transcription.contact_guess import mass_at_contact
 from impactopt.transcription.contact_state import Contact, ContactEnd, DrivePoint
 from impactopt.transcription.frozen_collision import FrozenCollision, InstantImpact
-from impactopt.transcription.layout import Array, Index, Place, Turn, determined, percent
+from impactopt.transcription.layout import Array, Index, Turn, determined
 from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
 

@@ -28,6 +28,7 @@ import numpy as np
 from impactopt.collision.graph import target_start
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ReferenceRange
+from impactopt.problem.violation import Measure, Place, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -38,13 +39,10 @@ from impactopt.transcription.layout import (
     Affine,
     Array,
     Group,
-    Measure,
-    Place,
     Turn,
     along,
     by_leg,
     determined,
-    percent,
     rates,
 )
 from impactopt.transcription.mesh import CollocationPoint, Shares, lagrange, place_of, segment_of

@@ -16,6 +16,7 @@ import numpy as np
 from impactopt.kinematics.splines import CubicSpline, basis, graded_breaks, knots, rate_weights
 from impactopt.kinematics.stance import contact_wrench_cone
 from impactopt.problem.problem import Phase
+from impactopt.problem.violation import Measure, Place, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact_state import Contact, ContactState
@@ -26,14 +27,11 @@ from impactopt.transcription.layout import (
     Array,
     Group,
     Index,
-    Measure,
-    Place,
     Turn,
     add,
     along,
     by_leg,
     determined,
-    percent,
     stack,
 )
 from impactopt.transcription.mesh import digits_of, percentage, with_middles

@@ -24,6 +24,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import support_polygon
 from impactopt.problem.block import BlockExpression
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.violation import Place, degrees, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.blocks import ExtraBlock, extra_blocks, own_blocks, stance_blocks
 from impactopt.transcription.builder import Builder
@@ -34,19 +35,7 @@ from impactopt.transcription.contact_conditions import add_balance, add_clearanc
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, add_coasting
-from impactopt.transcription.layout import (
-    Affine,
-    Array,
-    Group,
-    Index,
-    Place,
-    Turn,
-    along,
-    degrees,
-    determined,
-    percent,
-    rates,
-)
+from impactopt.transcription.layout import Affine, Array, Group, Index, Turn, along, determined, rates
 from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares
 from impactopt.transcription.motion_phase import AbortMotion, FollowThrough, Swing, add_nodes
 from impactopt.transcription.objective import Prices, assemble, cost_of_motion, motion_prices

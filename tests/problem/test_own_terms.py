@@ -17,11 +17,12 @@ from support.small_plans import changed
 from impactopt import Effort, Gaze, Impulse, InputError, Objective, Status, Term, TorqueLimit, write_problem
 from impactopt.planning.bounds import bounds_of
 from impactopt.planning.strike import optimize_strike
+from impactopt.problem.block import make_block
+from impactopt.problem.violation import millimetres
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.transcription.blocks import key_of, make_block
+from impactopt.transcription.blocks import key_of
 from impactopt.transcription.initial_guess import first_iterate, strike_iterate
-from impactopt.transcription.layout import millimetres
 from impactopt.transcription.objective import Quantity
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions

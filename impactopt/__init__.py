@@ -32,7 +32,7 @@ _PUBLIC = {
     "kinematics.operational_space": ("holding_torque", "striking_velocity"),
     "kinematics.stance": ("BothSoles", "FixedBase", "Free", "OneSole"),
     "collision": ("Effects", "JointFriction", "RigidImpact", "SDC", "VirtualMass", "effective_mass"),
-    "collision.coasting": ("coasting_reference",),
+    "collision.settings": ("coasting_reference",),
     "bodies.world": ("Ground", "Obstacle", "TargetBody"),
     "problem.problem": ("ImpactProblem", "Phase"),
     "problem.scenario": ("Scenario", "SecondStriker"),

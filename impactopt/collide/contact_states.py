@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 
 from impactopt.codegen.batched import BatchedFunction
 from impactopt.codegen.cache import cached, model_hash
-from impactopt.collision.coasting import coasting_reference
 from impactopt.collision.frozen import _inverse_of_cholesky
+from impactopt.collision.settings import coasting_reference
 from impactopt.errors import InputError, check_choice
 from impactopt.files.record import load_record
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
-from impactopt.kinematics.stance import Free, Stance
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import Free, Stance, support_polygon
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 

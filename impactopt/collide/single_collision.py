@@ -28,8 +28,7 @@ from impactopt.files.sections.diagnostics import mistakes_of, report_mistakes
 from impactopt.files.sections.reading import CollisionFile
 from impactopt.files.sections.values import Positive, Section
 from impactopt.files.toml import read_toml
-from impactopt.kinematics.stance import Free, Stance
-from impactopt.kinematics.support import margin, zmp
+from impactopt.kinematics.stance import Free, Stance, margin, zmp
 from impactopt.problem.checks import MOST_FREEZES
 from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot

@@ -16,10 +16,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.graph import frozen_dynamics, joint_space_model
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, rate_of_change
 from impactopt.collision.interface import Collision
 from impactopt.collision.model import JointSpaceModel
-from impactopt.collision.runge_kutta import rate_of_change
 from impactopt.collision.stepped import TAKE_FULL, SteppedModel
 from impactopt.contact import Board
 from impactopt.errors import InputError

@@ -25,7 +25,7 @@ from impactopt.files.problem_file.reading import change_data
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.record import FORMAT, NUMBERS, SUMMARY, Record, load_record, plain, read_json
 from impactopt.files.toml import read_toml, write_toml
-from impactopt.kinematics.support import corners_at, support_polygon
+from impactopt.kinematics.stance import corners_at, support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
 from impactopt.simulation.result import Simulation, state_at_contact

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import across
-from impactopt.kinematics.support import inward_edges, margin
+from impactopt.kinematics.stance import inward_edges, margin
 from impactopt.robots.robot import Robot
 from impactopt.robots.tools import inside
 

@@ -17,7 +17,7 @@ from impactopt.collide.single_collision import finer, meets_again, zmp_margins
 from impactopt.collision import SDC, Collision
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import support_polygon
 from impactopt.live.drawing import Drawing, Moment
 from impactopt.live.requests import LatestRequest
 from impactopt.live.server import LOCAL, LivePage, served

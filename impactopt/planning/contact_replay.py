@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.coasting import coasting_reference
 from impactopt.collision.interface import CollisionModel
 from impactopt.collision.sdc import frozen_model
+from impactopt.collision.settings import coasting_reference
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import independent_rates
 from impactopt.planning.budget import VIOLATED

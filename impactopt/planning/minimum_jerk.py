@@ -22,7 +22,7 @@ from scipy.optimize import linprog
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import quintic
-from impactopt.kinematics.support import contact_wrench_cone
+from impactopt.kinematics.stance import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, TorqueLimit, VelocityLimit
 from impactopt.robots.tools import inside

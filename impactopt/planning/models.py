@@ -29,12 +29,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import gear_torque
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.collision import jump_at_contact
-from impactopt.transcription.contact_guess import (
-    contact_order,
-    fastest_at_contact,
-    gentlest,
-    mass_at_contact,
-)
+from impactopt.transcription.contact_guess import contact_order, fastest_at_contact, gentlest, mass_at_contact
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.initial_guess import strike_rates
 

@@ -105,7 +105,7 @@ def best_of_starts(
             return climbed(problem, run, replace(budget, stop=stop))
     if workers > 1 and starts > 1:
         # compiled here, not by each worker
-        block_functions(with_room_for_gains(problem), problem.coordinates, budget.report)
+        block_functions(with_room_for_gains(problem), budget.report)
         return _best_on_workers(partial(one, problem, start), budget, starts=starts, workers=workers)
     with stopping() as stop:
         return one(problem, start, replace(budget, stop=stop), range(starts), starts + EXTRA_STARTS)

@@ -321,12 +321,12 @@ def program_for(
     # Given elements forbid a force that pulls (`ContactSet.guarded`): a program's default ones are not given.
     elements = elements or (t.hit.elements if t.hit.guarded else ())
     shares = t.hit.shares if shares is None else shares
-    functions = block_functions(problem, problem.coordinates, report, elements)
+    functions = block_functions(problem, report, elements)
     new: Program
     if isinstance(t, StrikeTranscription):
-        new = type(t)(problem, problem.coordinates, functions, elements, shares)
+        new = type(t)(problem, functions, elements, shares)
     else:
-        new = Transcription(problem, problem.coordinates, functions, nodes or t.nodes, elements, shares)
+        new = Transcription(problem, functions, nodes or t.nodes, elements, shares)
     return new.with_clearance(constraints) if constraints else new
 
 

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, check_choice
-from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.clearance_constraints import Margins, same_bodies
 from impactopt.planning.lazy_constraints import LazyTerms
+from impactopt.planning.oracles import BetweenNodes
 from impactopt.planning.parameter_changes import MOVABLE, Parameter, changed, moved_problem, parameter_of
 from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.refinement import refine as refine_with

@@ -17,12 +17,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.bounds import Cause
 from impactopt.planning.budget import VIOLATED, Budget, with_effort_of
-from impactopt.planning.causes import search
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solve_with_clearance
-from impactopt.planning.diagnosis import ended_with_violations, ipopt_retry, with_limits_kept, with_reason
+from impactopt.planning.diagnosis import (
+    ended_with_violations,
+    ipopt_retry,
+    search,
+    with_limits_kept,
+    with_reason,
+)
 from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
 from impactopt.planning.lazy_constraints import (
     LazyTerms,
@@ -31,14 +35,8 @@ from impactopt.planning.lazy_constraints import (
     with_lazy_constraints,
 )
 from impactopt.planning.models import carried_start, check_start, overloaded, with_order, with_order_of
-from impactopt.planning.motion_price import MotionPrice, with_first_scale
-from impactopt.planning.multistart import (
-    Guesses,
-    best_of,
-    best_of_starts,
-    check_starts,
-    drawn_guesses,
-)
+from impactopt.planning.multistart import Guesses, best_of, best_of_starts, check_starts, drawn_guesses
+from impactopt.planning.oracles import BetweenNodes, MotionPrice, with_first_scale
 from impactopt.planning.refinement import Guess, Oracle, Outcome, refine
 from impactopt.planning.solution import Solution, program_of, program_on, solution_of
 from impactopt.planning.strike import clear_strike
@@ -405,7 +403,7 @@ def _guesses(
     """
     if not isinstance(start, str):
         return [("given", partial(Guess, program=t, start=start))]
-    strike = StrikeTranscription(t.problem, t.coordinates, t.functions) if start == "strike" else None
+    strike = StrikeTranscription(t.problem, t.functions) if start == "strike" else None
 
     def guess(draw: dict[str, Any]) -> Guess[Transcription]:
         if strike is None:

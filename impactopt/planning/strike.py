@@ -23,13 +23,7 @@ from impactopt.planning.diagnosis import with_reason
 from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
 from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, lazy_terms_of, with_lazy_constraints
 from impactopt.planning.models import carried_start, check_start, with_order, with_order_of
-from impactopt.planning.multistart import (
-    Guesses,
-    best_of,
-    best_of_starts,
-    check_starts,
-    drawn_guesses,
-)
+from impactopt.planning.multistart import Guesses, best_of, best_of_starts, check_starts, drawn_guesses
 from impactopt.planning.refinement import Additions, Guess, Outcome, carried, program_for, refine
 from impactopt.planning.solution import Solved, impact_summary, versions
 from impactopt.problem.problem import ImpactProblem
@@ -193,8 +187,8 @@ def _program_on(
     problem: ImpactProblem, elements: Elements, shares: Shares, report: Callable[[str], None] | None = None
 ) -> StrikeTranscription:
     """Program of a strike on a given mesh of the contact, without clearance constraints."""
-    functions = block_functions(problem, problem.coordinates, report, elements)
-    return StrikeTranscription(problem, problem.coordinates, functions, elements, shares)
+    functions = block_functions(problem, report, elements)
+    return StrikeTranscription(problem, functions, elements, shares)
 
 
 def clear_strike(

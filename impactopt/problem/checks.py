@@ -33,7 +33,7 @@ from impactopt.errors import (
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import ConstrainedDynamics
-from impactopt.kinematics.support import margin, shrink, support_polygon
+from impactopt.kinematics.stance import margin, shrink, support_polygon
 from impactopt.problem.motion_style import STYLES
 from impactopt.problem.objectives import Penetration, TargetEnergy
 from impactopt.problem.terms import ContactWrenchCone, Grip, MotorCurve, PowerLimit, Term

@@ -15,7 +15,7 @@ from impactopt.contact.targets import Nail
 from impactopt.errors import InputError, counted
 from impactopt.kinematics.inverse_kinematics import Reach, inverse_kinematics, reach
 from impactopt.kinematics.operational_space import striking_point
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import support_polygon
 from impactopt.problem.plausibility import giant_soles
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import random_postures

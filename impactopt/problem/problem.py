@@ -31,8 +31,7 @@ from impactopt.contact.targets.base import TOUCH, ContactPhase, contact_phases, 
 from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, check_kind, check_name
 from impactopt.kinematics.coordinates import MAX_START_PITCH, StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
-from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance, support_polygon
 from impactopt.problem import checks
 from impactopt.problem.checks import COLLISIONS, INSTANT
 from impactopt.problem.hashing import problem_hash

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError, check_array, shortened
 from impactopt.kinematics.coordinates import LegClosure, StanceCoordinates
-from impactopt.kinematics.stance import BothSoles, OneSole, Stance
-from impactopt.kinematics.support import corners_at, overlap
+from impactopt.kinematics.stance import BothSoles, OneSole, Stance, corners_at, overlap
 from impactopt.problem.checks import check_parts
 from impactopt.problem.scenario import Phase
 from impactopt.robots.robot import Robot

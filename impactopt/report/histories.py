@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.files.record import Record
-from impactopt.kinematics.support import convex_polygon, margin
+from impactopt.kinematics.stance import convex_polygon, margin
 from impactopt.simulation.result import centre_of_pressure
 
 Array = NDArray[np.float64]

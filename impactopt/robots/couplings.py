@@ -1,4 +1,6 @@
-"""Couplings: joints that follow others, as by `<mimic>` of a URDF or a joint equality of an MJCF.
+"""Couplings, by which joints follow others, and tendons, which bound weighted sums of joint angles.
+
+A coupling is a `<mimic>` of a URDF or a joint equality of an MJCF, a tendon a limited fixed one of MuJoCo.
 
 A follower's angle is a multiple of its leader's, plus an offset. In the `pin.Model` it is a
 `JointModelMimic`, without a coordinate of its own: with v_all = S v, where v_all are the velocities of all
@@ -7,8 +9,9 @@ joints, inertias are S'HS, forces S'tau and Jacobians J S.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -17,14 +20,15 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError, Mistakes
 from impactopt.robots.build import (
     friction,
+    joint_index,
     joint_indices,
     set_friction,
     set_velocity_limit,
     velocity_limit,
 )
+from impactopt.robots.model import MIMIC, axis_of
 
 Array = NDArray[np.float64]
-_MIMIC = "JointModelMimic"
 
 
 class Coupling(NamedTuple):
@@ -35,35 +39,12 @@ class Coupling(NamedTuple):
     offset: float
 
 
-class Axis(NamedTuple):
-    """Placement and axis of a joint, at zero of its coordinate.
-
-    placement : pin.SE3 in the parent's frame.  subspace (6,) : unit twist [linear; angular] of the joint.
-    ratio : derivative of the joint's angle by its coordinate; 1 unless it is a follower.
-    """
-
-    placement: Any
-    subspace: Array
-    ratio: float
-
-
-def axis_of(model: pin.Model, joint: int) -> Axis:
-    """Axis of a joint with one degree of freedom, or of a follower."""
-    kind = model.joints[joint]
-    data, ratio = kind.createData(), 1.0
-    kind.calc(data, pin.neutral(model))
-    if kind.shortname() == _MIMIC:
-        ratio = float(kind.extract().scaling)
-    subspace = np.asarray(data.S, dtype=float).reshape(6) / ratio
-    return Axis(model.jointPlacements[joint] * data.M, subspace, ratio)
-
-
 def couplings_of(model: pin.Model) -> dict[str, Coupling]:
     """Couplings of a model, by the follower's name."""
     leaders = {int(model.joints[j].idx_v): str(model.names[j]) for j in joint_indices(model)}
     out = {}
     for j in range(1, model.njoints):
-        if model.joints[j].shortname() == _MIMIC:
+        if model.joints[j].shortname() == MIMIC:
             kind = model.joints[j].extract()
             leader = leaders[int(model.joints[j].idx_v)]
             out[str(model.names[j])] = Coupling(leader, float(kind.scaling), float(kind.offset))
@@ -213,3 +194,83 @@ def _reflect_on_leader(model: pin.Model, name: str, coupling: Coupling) -> None:
             f"are {ends[0]:.4g} to {ends[1]:.4g} rad of {leader!r}; correct their <limit>s or the offset"
         )
     model.lowerPositionLimit, model.upperPositionLimit = low, high
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tendon:
+    """Bounds on a weighted sum of joint angles: lower <= sum of coefficient x angle <= upper.
+
+    name : of the tendon.  coefficients : by joint, without unit.  lower, upper [rad] : of the sum.
+    """
+
+    name: str
+    coefficients: Mapping[str, float]
+    lower: float
+    upper: float
+
+    def __str__(self) -> str:
+        sum_of = " ".join(f"{factor:+g} {joint}" for joint, factor in self.coefficients.items())
+        return f"{self.name}: {self.lower:g} <= {sum_of} <= {self.upper:g}"
+
+    def without(self, locked: Mapping[str, float], couplings: Mapping[str, Coupling]) -> Tendon:
+        """The same bounds on the remaining joints: locked ones, at an angle [rad], are moved to the bounds,
+        followers are replaced by their leaders.
+        """
+        constant, left = 0.0, dict[str, float]()
+        for joint, factor in self.coefficients.items():
+            if joint in locked:
+                constant += factor * locked[joint]
+                continue
+            leader, ratio, offset = couplings.get(joint, (joint, 1.0, 0.0))
+            constant += factor * offset
+            left[leader] = left.get(leader, 0.0) + factor * ratio
+        left = {joint: factor for joint, factor in left.items() if factor}
+        return replace(self, coefficients=left, lower=self.lower - constant, upper=self.upper - constant)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ranges:
+    """Ranges of a robot's n joints and, after them, of its tendons.
+
+    names : of both.  lower, upper (n + tendons,) [rad].  matrix (tendons, n) : coefficients of the tendons.
+    """
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    matrix: Array
+
+    @classmethod
+    def of(cls, joints: Sequence[str], lower: Array, upper: Array, tendons: Sequence[Tendon]) -> Ranges:
+        """Ranges of joints (n,) and tendons."""
+        return cls(
+            names=(*joints, *(f"tendon {tendon.name}" for tendon in tendons)),
+            lower=np.append(lower, [tendon.lower for tendon in tendons]),
+            upper=np.append(upper, [tendon.upper for tendon in tendons]),
+            matrix=np.array(
+                [[tendon.coefficients.get(joint, 0.0) for joint in joints] for tendon in tendons]
+            ).reshape(-1, len(joints)),
+        )
+
+    def positions(self, angles: Array) -> Array:
+        """(..., n + tendons) [rad] of joint angles (..., n)."""
+        return np.concatenate([angles, angles @ self.matrix.T], axis=-1)
+
+    def excess(self, angles: Array) -> tuple[str, float]:
+        """Name and excess [rad] of the joint or tendon farthest out of its range, at joint angles (k, n)."""
+        at = self.positions(angles)
+        most = np.maximum(at - self.upper, self.lower - at).max(axis=0)
+        worst = int(np.argmax(most))
+        return self.names[worst], float(most[worst])
+
+
+def check_tendons(tendons: Sequence[Tendon], joints: Sequence[str]) -> None:
+    """InputError for a tendon with unknown joints, an empty range, or no joints."""
+    for tendon in tendons:
+        what = f"tendon {tendon.name!r}"
+        for joint in tendon.coefficients:
+            joint_index(joints, joint, what)
+        if not tendon.lower < tendon.upper:
+            raise InputError(f"{what}: its range is {tendon.lower:g} to {tendon.upper:g}; give lower < upper")
+        if not tendon.coefficients:
+            raise InputError(f"{what} is out of its range at the angles of its locked joints; change those")

@@ -24,9 +24,8 @@ from impactopt.robots.build import (
     velocity_limit,
 )
 from impactopt.robots.checks import INERTIAS, POSITION_SLACK, REPAIRED, repair_inertias
-from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
+from impactopt.robots.couplings import Coupling, Ranges, Tendon, coupled, couplings_of, with_followers
 from impactopt.robots.model import JointAngles
-from impactopt.robots.tendons import Ranges, Tendon
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, missing_package
 from impactopt.robots.build import ROOT, existing, friction, set_friction
+from impactopt.robots.couplings import Tendon
 from impactopt.robots.description import Description, Tie, between
 from impactopt.robots.gravity_compensation import CompensatedBody, Compensation, compensation
 from impactopt.robots.model import JointAngles
-from impactopt.robots.tendons import Tendon
 
 Array = NDArray[np.float64]
 _OUT = "take it out"

@@ -20,10 +20,16 @@ from impactopt.robots import urdf as _urdf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, known, numbers_of, with_classes
 from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, read_only
 from impactopt.robots.checks import GIVEN, REPAIRED, check_inertias, tell_apart
-from impactopt.robots.couplings import Coupling, couplings_of, follower_axes, restore_followers
-from impactopt.robots.forward_kinematics import ForwardKinematics
-from impactopt.robots.model import JointAngles
-from impactopt.robots.tendons import Ranges, Tendon, check_tendons
+from impactopt.robots.couplings import (
+    Coupling,
+    Ranges,
+    Tendon,
+    check_tendons,
+    couplings_of,
+    follower_axes,
+    restore_followers,
+)
+from impactopt.robots.model import ForwardKinematics, JointAngles
 from impactopt.robots.tools import check_sole, with_hinges
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]

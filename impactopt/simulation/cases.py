@@ -12,9 +12,8 @@ from scipy.optimize import minimize
 from impactopt.collision import Collision, effective_mass
 from impactopt.errors import InputError, check_positive
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.stance import USUAL_POSTURE, Stance, stance_of
-from impactopt.kinematics.support import margin as margin_in
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import USUAL_POSTURE, Stance, stance_of, support_polygon
+from impactopt.kinematics.stance import margin as margin_in
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]

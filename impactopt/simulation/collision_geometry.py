@@ -28,7 +28,6 @@ class Solid:
         inflated by ``radius`` [m], at ``place`` (3,) with axes ``rotation`` (3, 3).
     of_target : it exists only with the target.
     moves : it moves with the target.
-    before : it exists before contact only.
     strikable : the striking link may touch it.
     """
 
@@ -41,7 +40,6 @@ class Solid:
     rotation: Array | None = None
     of_target: bool = False
     moves: bool = False
-    before: bool = False
     strikable: bool = False
 
     @cached_property

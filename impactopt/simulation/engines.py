@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, check_array, check_choice, check_kind, check_number, check_whole
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import HitRegion
 from impactopt.robots.robot import Robot
@@ -73,7 +73,6 @@ def solids_of(problem: ImpactProblem) -> Solids:
                 rotation=body.rotation,
                 of_target=body.of_target,
                 moves=body.moves,
-                before=body.before,
                 strikable=body.strikable,
             )
         )

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError, missing_package
-from impactopt.robots.couplings import axis_of
-from impactopt.robots.model import principal_moments
+from impactopt.robots.model import axis_of, principal_moments
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
-from impactopt.simulation.sliding_points import SlidingPoints
+from impactopt.simulation.target_dynamics import SlidingPoints
 
 Array = NDArray[np.float64]
 # hardest equality that MuJoCo accepts: impedance, and time constant in steps

@@ -18,7 +18,7 @@ from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
 from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
-from impactopt.simulation.sliding_points import SlidingPoints
+from impactopt.simulation.target_dynamics import SlidingPoints
 
 Array = NDArray[np.float64]
 _AXES = pin.LOCAL_WORLD_ALIGNED

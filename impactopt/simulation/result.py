@@ -427,7 +427,7 @@ def centre_of_pressure(wrench: Array) -> Array:
 def distance_inside(polygon: Array, points: Array) -> Array:
     """Distance (k,) [m] of points (k, 2) from a counter-clockwise polygon's nearest edge, < 0 outside."""
     edge = np.roll(polygon, -1, axis=0) - polygon
-    # As `kinematics.support.margin`, which engines do not import: they share no code with the planner. Edges
+    # As `kinematics.stance.margin`, which engines do not import: they share no code with the planner. Edges
     # of a counter-clockwise polygon have the inside on their left.
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     return np.asarray((points @ inward.T - (inward * polygon).sum(axis=1)).min(axis=1))

@@ -182,7 +182,7 @@ def _compile(chosen: Sweep, problem: ImpactProblem, work: Work, say: Callable[[s
         say("building the collision (compiles the first time)")
         evaluate(work, Unit(index=0, first=0, count=1, columns=chosen.design.columns(0, 1)))
     else:
-        block_functions(problem, problem.coordinates, say)
+        block_functions(problem, say)
 
 
 def _work(chosen: Sweep, store: Store) -> Work:

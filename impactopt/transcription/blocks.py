@@ -15,11 +15,8 @@ from typing import Any
 
 import casadi as ca
 
-from impactopt.collision.settings import Effects
 from impactopt.contact.fields import IS_NAN, has_nan
 from impactopt.contact.friction import moves_target
-from impactopt.contact.laws import ContactLaw
-from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
 from impactopt.kinematics.stages import Stage, motion_in_stages, velocity_in_stages
@@ -44,38 +41,15 @@ from impactopt.transcription.contact_blocks import (
 )
 from impactopt.transcription.mesh import Elements, contact_mesh
 
-__all__ = [
-    "BlockExpression",
-    "ExtraBlock",
-    "builders",
-    "extra_blocks",
-    "key_of",
-    "make_block",
-    "own_blocks",
-    "sizes",
-    "stance_blocks",
-]
 
-
-def sizes(
-    c: StanceCoordinates,
-    target: Target,
-    block: str,
-    *,
-    frozen: bool = False,
-    second: bool = False,
-    bristles: bool = False,
-    moves_target: bool = False,
-) -> dict[str, int]:
-    """Lengths of the named slices of a block's output, in order.
-
-    frozen : of a model with frozen dynamics.  second : with a second striker.  bristles : of friction.
-    moves_target : friction moves the target across the normal.
-    """
+def sizes(c: StanceCoordinates, problem: ImpactProblem, block: str) -> dict[str, int]:
+    """Lengths of the named slices of a block's output at these coordinates, in order."""
     n, base, soles = c.robot.n, c.base, len(c.legs)
+    frozen, second = problem.frozen is not None, problem.second is not None
+    friction, guarded = problem.friction, int(bool(problem.target.guards))
     legs = {"legs": c.nl, "lag": c.nl, "hand": 1} if frozen else {}
-    bent = {"bristles": 3 + 3 * second} if bristles else {}
-    bent |= {"tangential": 3} if moves_target else {}
+    bent = {"bristles": 3 + 3 * second} if friction is not None and friction.bristles else {}
+    bent |= {"tangential": 3} if moves_target(friction) else {}
     coasting = {"rate": c.nl, "acceleration": c.nl} if frozen else {"twist": 6 * soles}
     return {
         "node": {"closure": 6 * soles, "base": base, "torque": n, "leg_rate": c.nl, "extension": soles},
@@ -87,16 +61,16 @@ def sizes(
         "carried": {"base": base},
         "force": {
             "law": 1,
-            "target": target.n_states,
+            "target": problem.target.n_states,
             "travel": 1,
             "impulse": 1,
             "rate": 1,
             "penetration": 1,
             "separation": 1,
             "speed": 1,
-            "event": int(bool(target.guards)),
-            "invariant": int(bool(target.guards)),
-            "reserve": int(bool(target.guards)),
+            "event": guarded,
+            "invariant": guarded,
+            "reserve": guarded,
             **(dict.fromkeys(SECOND, 1) if second else {}),
         },
         "impact": {"base": base, "joints": n, "blow": 1},
@@ -263,35 +237,21 @@ def momentum(c: StanceCoordinates) -> BlockExpression:
     return make_block([y, y1, T], [weight, lever], {"momentum": out}, [(u, y1 / T)], stages=stages)
 
 
-def builders(
-    c: StanceCoordinates,
-    striker: str,
-    law: ContactLaw,
-    target: Target,
-    edges: int,
-    *,
-    instant: bool = False,
-    frozen: Effects | None = None,
-    freezes: int = 0,
-    first: bool = False,
-    second: str = "",
-    gain_groups: JointGroups = (),
-    friction: int = 0,
-    moves_target: bool = False,
-) -> dict[str, Callable[[], BlockExpression]]:
-    """Functions that build the expressions of the blocks, by name.
+def own_blocks(problem: ImpactProblem, edges: int = 0) -> dict[str, Callable[[], BlockExpression]]:
+    """Functions that build the expressions of the blocks which every program of this problem has, by name.
 
     They are slow, and are called only if the compiled library is not in the cache.
 
-    edges : of the support polygon.  instant : for an impact without duration.
-    frozen, freezes : terms of a model with frozen dynamics, and its number of freezes during contact.
-    first : with the first instant of contact.  second : another striker.
-    gain_groups : joints that share a gain factor.  friction : number of parameters of the
-        striking points' friction.  moves_target : it moves the target across the normal.
+    edges : of the support polygon.
     """
+    c, striker, frozen, second = problem.coordinates, problem.striker, problem.frozen, problem.second
+    gain_groups = problem.gain_joints
+    friction = 0 if problem.friction is None else len(problem.friction.parameters)
+    moves = moves_target(problem.friction)
+    other = "" if second is None else second.striker
     lasting: dict[str, Callable[[], BlockExpression]] = {
-        "collision": lambda: collision(c, striker, frozen, second, gain_groups, friction, moves_target),
-        "force": lambda: force(c, striker, law, target, frozen, second),
+        "collision": lambda: collision(c, striker, frozen, other, gain_groups, friction, moves),
+        "force": lambda: force(c, striker, problem.law, problem.target, frozen, other),
     }
     if c.legs:
         lasting["coasting"] = lambda: coasting(c, frozen)
@@ -299,21 +259,21 @@ def builders(
         lasting["carried"] = lambda: carried(c)
     if frozen is not None:
         lasting["moved"] = lambda: moved(c, striker)
-    if frozen is not None and frozen.jdot and not freezes:
+    if frozen is not None and frozen.jdot and not problem.freezes:
         # one freeze, at the velocity v_meet, which an impact without rebound determines (`FrozenCollision`)
         lasting["impact"] = lambda: impact(c, striker)
-    if target.guards:
+    if problem.target.guards:
         lasting["join"] = join
-    if second:
-        lasting["second_contact"] = lambda: contact(c, second)
-        lasting["second_approach"] = lambda: approach(c, second)
-    if first:
-        lasting["first"] = lambda: first_instant(c, striker, law, friction)
+    if second is not None:
+        lasting["second_contact"] = lambda: contact(c, other)
+        lasting["second_approach"] = lambda: approach(c, other)
+    if problem.first_instant:
+        lasting["first"] = lambda: first_instant(c, striker, problem.law, friction)
     return {
         "node": lambda: node(c),
         "contact": lambda: contact(c, striker),
         "approach": lambda: approach(c, striker),
-        **({"impact": lambda: impact(c, striker)} if instant else lasting),
+        **(lasting if problem.lasts else {"impact": lambda: impact(c, striker)}),
         "link": link,
         **({"balance": lambda: balance(c, edges)} if c.legs else {}),
         **({"momentum": lambda: momentum(c)} if c.drifts else {}),
@@ -350,30 +310,7 @@ class ExtraBlock:
     user: bool = False
 
 
-def own_blocks(
-    problem: ImpactProblem, c: StanceCoordinates, edges: int = 0
-) -> dict[str, Callable[[], BlockExpression]]:
-    """Functions that build the blocks which every program of this problem has (`builders`)."""
-    return builders(
-        c,
-        problem.striker,
-        problem.law,
-        problem.target,
-        edges,
-        instant=not problem.lasts,
-        frozen=problem.frozen,
-        freezes=problem.freezes,
-        first=problem.first_instant,
-        second="" if problem.second is None else problem.second.striker,
-        gain_groups=problem.gain_joints,
-        friction=0 if problem.friction is None else len(problem.friction.parameters),
-        moves_target=moves_target(problem.friction),
-    )
-
-
-def extra_blocks(
-    problem: ImpactProblem, c: StanceCoordinates, elements: Elements = ()
-) -> dict[str, ExtraBlock]:
+def extra_blocks(problem: ImpactProblem, elements: Elements = ()) -> dict[str, ExtraBlock]:
     """Blocks of the problem's objectives and terms, by name.
 
     elements : of the contact; (): the problem's.
@@ -382,13 +319,13 @@ def extra_blocks(
     ------
     InputError : a name that is taken, or is no function's name; something other than a block.
     """
-    taken = {*own_blocks(problem, c)}
+    taken = {*own_blocks(problem)}
     out: dict[str, ExtraBlock] = {}
     sources: list[Term | Objective] = [*problem.objectives, *problem.active_terms]
     # the package's first, so that a name that is taken is reported of the user's class
     for source in sorted(sources, key=lambda s: not type(s).__module__.startswith("impactopt.")):
         where = f"{type(source).__name__}.blocks"
-        made = source.blocks(problem, c)
+        made = source.blocks(problem, problem.coordinates)
         if not isinstance(made, Mapping):
             raise InputError(f"{where} gives {made!r}; give a dict of blocks by name, {{}} for none")
         for name, block in made.items():

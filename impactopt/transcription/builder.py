@@ -1,21 +1,112 @@
-"""Nonlinear program (NLP) under construction: variables, blocks, constraints and limits, for all parts."""
+"""Nonlinear program (NLP) under construction: variables, blocks, constraints and limits, for all parts.
+
+A block is many instances of a compiled function with its derivatives.
+"""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from impactopt.contact.friction import moves_target
+from impactopt.codegen.batched import BatchedFunction
 from impactopt.errors import InputError, did_you_mean
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.violation import Measure, Place
 from impactopt.transcription import blocks as symbolic
-from impactopt.transcription.batched import Block
-from impactopt.transcription.layout import Array, Constraints, Group, Index, Layout, Limits, Measure, Place
+from impactopt.transcription.layout import Affine, Array, Constraints, Group, Index, Layout, Limits, stack
+
+
+@dataclass
+class Block:
+    """``count`` instances of a compiled function out = f(z, p), its Jacobian, and the Hessian of lambda.out.
+
+    lift : z of all instances (count * n_in) as affine expressions in the program's variables.
+    jac_pattern, hess_pattern : row and column indices of an instance's nonzeros.
+    """
+
+    name: str
+    value: BatchedFunction
+    jacobian: BatchedFunction
+    hessian: BatchedFunction
+    n_in: int
+    n_out: int
+    count: int
+    lift: Affine
+    jac_pattern: tuple[Index, Index]
+    hess_pattern: tuple[Index, Index]
+
+    @property
+    def parameters(self) -> Array:
+        """Parameters (count, n_p)."""
+        return self.value.inputs[1][: self.count]
+
+    def take_parameters(self, parameters: Array) -> None:
+        """Use these parameters (count, n_p), or (n_p,) for all instances, from now on."""
+        parameters = np.broadcast_to(parameters, self.parameters.shape)
+        for function in (self.value, self.jacobian, self.hessian):
+            function.take_parameters(parameters)
+
+    def copy(self) -> Block:
+        """Copy for another program, as a program sets the arrays that its blocks write to."""
+        parts = {name: getattr(self, name).copy() for name in ("value", "jacobian", "hessian")}
+        return replace(self, **parts)
+
+    @classmethod
+    def make(
+        cls,
+        name: str,
+        functions: dict[str, Any],
+        instances: Sequence[Sequence[Affine]],
+        parameters: ArrayLike,
+    ) -> Block:
+        """Block whose z is given as parts.
+
+        functions : compiled, of one instance or by `impactopt.transcription.simd.in_lanes`: ``name``,
+            ``name_jac`` and ``name_hess``.
+        instances : of each, the affine expressions ("slots") that make up its z, in order.
+        parameters : (n_p,) for all instances, or (count, n_p).
+        """
+        n_in = functions[name].size1_in(0)
+        lifts = [stack(slots) for slots in instances]
+        for lift in lifts:
+            if lift.size != n_in:
+                raise InputError(f"block {name} takes {n_in} inputs, was given {lift.size}")
+        return cls.of_lift(name, functions, stack(lifts), len(lifts), parameters)
+
+    @classmethod
+    def of_lift(
+        cls, name: str, functions: dict[str, Any], lift: Affine, count: int, parameters: ArrayLike
+    ) -> Block:
+        """Block, as of :meth:`make`, with z of all instances (count * n_in) as one expression."""
+        f, j, h = functions[name], functions[f"{name}_jac"], functions[f"{name}_hess"]
+        n_in, n_out = f.size1_in(0), f.size1_out(0)
+        p, n_p = np.asarray(parameters, dtype=float), f.size1_in(1)
+        if p.ndim and p.shape[-1] != n_p:
+            raise InputError(f"block {name} takes {n_p} parameters, was given {p.shape[-1]}")
+        if p.ndim == 2 and len(p) not in (1, count):
+            raise InputError(f"block {name} has {count} instances, was given parameters of {len(p)}")
+        if np.isnan(p).any():
+            raise InputError(f"block {name}: a parameter is NaN; give numbers")
+        p = np.broadcast_to(p, (count, n_p))
+        value, jacobian, hessian = (BatchedFunction(function, count, p) for function in (f, j, h))
+        return cls(
+            name=name,
+            value=value,
+            jacobian=jacobian,
+            hessian=hessian,
+            n_in=n_in,
+            n_out=n_out,
+            count=count,
+            lift=lift,
+            jac_pattern=jacobian.pattern,
+            hess_pattern=hessian.pattern,
+        )
 
 
 class Builder:
@@ -32,9 +123,8 @@ class Builder:
     followers : functions that :meth:`follow` has been given.
     """
 
-    def __init__(
-        self, problem: ImpactProblem, coordinates: StanceCoordinates, functions: dict[str, Any]
-    ) -> None:
+    def __init__(self, problem: ImpactProblem, functions: dict[str, Any]) -> None:
+        coordinates = problem.coordinates
         self.problem, self.coordinates, self.robot = problem, coordinates, problem.robot
         self.functions, self.limits = functions, Limits(problem, coordinates)
         self.ny, self.nl, self.nw = coordinates.ny, coordinates.nl, 6 * len(coordinates.legs)
@@ -131,16 +221,7 @@ class Builder:
         group = self.layout.add(
             name, 1, size, lower=lower, upper=upper, scale=scale, labels=labels, measure=measure
         )
-        self.constraints.add(
-            term=term or name,
-            place=place,
-            components=labels,
-            outputs=outputs,
-            affine=-group[0],
-            lower=0,
-            upper=0,
-            measure=measure,
-        )
+        self.equal(term or name, place, labels, outputs, measure, affine=-group[0])
         # in the order of their making, as an output may depend on variables lifted before (`with_lifted`)
         self.lifted.append((group, np.asarray(outputs, dtype=np.intp)))
         return group
@@ -150,15 +231,18 @@ class Builder:
         term: str,
         place: Place | str,
         components: Sequence[str],
-        outputs: Any,
+        outputs: Any = None,
         measure: Measure | Sequence[Measure] | None = None,
+        *,
+        affine: Affine | None = None,
     ) -> None:
-        """Constrain outputs of blocks to zero."""
+        """Constrain outputs of blocks, affine expressions, or the sums of both, to zero."""
         self.constraints.add(
             term=term,
             place=place,
             components=components,
             outputs=outputs,
+            affine=affine,
             lower=0,
             upper=0,
             measure=measure,
@@ -166,16 +250,6 @@ class Builder:
 
     def parts(self, block: str) -> dict[str, Any]:
         """Indices of the named slices of a block's output, within an instance."""
-        frozen = self.problem.frozen is not None
-        second, friction = self.problem.second is not None, self.problem.friction
-        size = symbolic.sizes(
-            self.coordinates,
-            self.problem.target,
-            block,
-            frozen=frozen,
-            second=second,
-            bristles=friction is not None and friction.bristles,
-            moves_target=moves_target(friction),
-        )
+        size = symbolic.sizes(self.coordinates, self.problem, block)
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}

@@ -22,11 +22,11 @@ from impactopt.bodies.world import WorldBody
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
-from impactopt.robots.couplings import Axis, axis_of
+from impactopt.problem.violation import Place, millimetres
+from impactopt.robots.model import Axis, axis_of
 from impactopt.robots.robot import Robot
-from impactopt.transcription.batched import Block
-from impactopt.transcription.builder import Builder
-from impactopt.transcription.layout import Affine, Array, ConstraintOrigin, Index, Place, millimetres, stack
+from impactopt.transcription.builder import Block, Builder
+from impactopt.transcription.layout import Affine, Array, ConstraintOrigin, Index, stack
 
 TOO_NEAR = millimetres("too near")
 

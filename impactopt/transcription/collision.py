@@ -20,6 +20,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
+from impactopt.problem.violation import Measure, Place, millimetres, percent
 from impactopt.robots.model import mass_matrix
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
@@ -39,14 +40,10 @@ from impactopt.transcription.layout import (
     Array,
     Group,
     Index,
-    Measure,
-    Place,
     Turn,
     along,
     by_leg,
     determined,
-    millimetres,
-    percent,
     rates,
 )
 from impactopt.transcription.mesh import CollocationPoint
@@ -566,15 +563,7 @@ class Collision(ContactParameters):
             integral = integral - rate[m] * w
         if not s.new_phase:
             integral = integral - integrals[s.previous]
-        self._b.constraints.add(
-            term="collision kinematics",
-            place=place,
-            components=labels,
-            affine=integral,
-            lower=0,
-            upper=0,
-            measure=rates(labels),
-        )
+        self._b.equal("collision kinematics", place, labels, measure=rates(labels), affine=integral)
 
     # ------------------------------------------------------------------ constraints
     def add_constraints(self, at: dict[str, tuple[int, int]]) -> None:

@@ -17,9 +17,9 @@ from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.problem.terms.base import kind_of
+from impactopt.problem.violation import Measure, Place
 from impactopt.solvers.program import Determined
-from impactopt.transcription.batched import Block
-from impactopt.transcription.builder import Builder
+from impactopt.transcription.builder import Block, Builder
 from impactopt.transcription.clearance import (
     ClearanceKey,
     SeparatingDirection,
@@ -39,8 +39,6 @@ from impactopt.transcription.layout import (
     Group,
     Index,
     Layout,
-    Measure,
-    Place,
     Turn,
     by_choice,
     determined,

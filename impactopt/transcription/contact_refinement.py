@@ -136,7 +136,7 @@ class _FinerContact:
     """Program of the contact alone, on elements half as long, from a given state at contact."""
 
     def __init__(self, t: ContactProgram, x: Array) -> None:
-        self._planned, b = t.hit, Builder(t.problem, t.coordinates, t.functions)
+        self._planned, b = t.hit, Builder(t.problem, t.functions)
         # the state at contact is no variable here: expressions without terms in x
         given = ContactState(*(Affine.constant(e.evaluate(x)) for e in t.hit.contact.state))
         self._builder = b

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from impactopt.contact.friction import moves_target
+from impactopt.problem.violation import Place, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision, FirstInstant
 from impactopt.transcription.contact_guess import mass_at_contact
 from impactopt.transcription.contact_state import Contact, ContactEnd, DrivePoint
 from impactopt.transcription.frozen_collision import FrozenCollision, InstantImpact
-from impactopt.transcription.layout import Array, Index, Place, Turn, determined, percent
+from impactopt.transcription.layout import Array, Index, Turn, determined
 from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
 
@@ -116,15 +117,13 @@ class ContactSet:
 
     def add_feedforward_constraints(self, torque: Index) -> None:
         """Constrain the feed-forward to the torque at the node at contact, whose outputs (n,) are given."""
-        self._b.constraints.add(
-            term="feed-forward that makes the robot coast",
-            place="contact",
-            components=self._b.robot.joint_names,
-            outputs=torque,
+        self._b.equal(
+            "feed-forward that makes the robot coast",
+            "contact",
+            self._b.robot.joint_names,
+            torque,
+            percent("of the joint's limit off"),
             affine=-self.contact.feedforward[0],
-            lower=0,
-            upper=0,
-            measure=percent("of the joint's limit off"),
         )
 
     def update_parameters(self, *, anew: bool) -> None:

@@ -28,6 +28,7 @@ import numpy as np
 from impactopt.collision.graph import target_start
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ReferenceRange
+from impactopt.problem.violation import Measure, Place, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -38,13 +39,10 @@ from impactopt.transcription.layout import (
     Affine,
     Array,
     Group,
-    Measure,
-    Place,
     Turn,
     along,
     by_leg,
     determined,
-    percent,
     rates,
 )
 from impactopt.transcription.mesh import CollocationPoint, Shares, lagrange, place_of, segment_of
@@ -472,26 +470,15 @@ class FrozenCollision(Collision):
         for group, instance, name in parts:
             outputs = start + instance * size + part[name]
             measure = along(group.labels, "off") if name == "y" else Measure("m/s", 1.0, "off")
-            b.constraints.add(
-                term="state to freeze at",
-                place=group.name,
-                components=group.labels,
-                outputs=outputs,
-                affine=-group[0],
-                lower=0,
-                upper=0,
-                measure=measure,
-            )
+            b.equal("state to freeze at", group.name, group.labels, outputs, measure, affine=-group[0])
             b.lifted.append((group, np.asarray(outputs, dtype=np.intp)))
         for group, legs in zip(self.frozen_legs, self._legs_at, strict=True):
-            b.constraints.add(
-                term="state to freeze at",
-                place=group.name,
-                components=group.labels,
-                affine=legs - group[0],
-                lower=0,
-                upper=0,
+            b.equal(
+                "state to freeze at",
+                group.name,
+                group.labels,
                 measure=along(group.labels, "off"),
+                affine=legs - group[0],
             )
 
     def _add_coasting(self, start: int, size: int) -> None:
@@ -517,14 +504,12 @@ class FrozenCollision(Collision):
         b.equal(term, place, DIRECTIONS[: b.coordinates.base], outputs, b.limits.unbalanced)
         more = self.carried[0] - self.contact.state.w
         for k in range(1, len(b.coordinates.legs)):
-            b.constraints.add(
-                term=term,
-                place=place,
-                components=self.carried.labels[6 * k : 6 * k + 6],
-                affine=more[6 * k : 6 * k + 6] - more[:6],
-                lower=0,
-                upper=0,
+            b.equal(
+                term,
+                place,
+                self.carried.labels[6 * k : 6 * k + 6],
                 measure=b.limits.unbalanced[:6],
+                affine=more[6 * k : 6 * k + 6] - more[:6],
             )
 
     def _add_dynamics(self, i: int, place: Place, first: dict[str, int]) -> None:

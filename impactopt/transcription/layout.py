@@ -36,35 +36,9 @@ from impactopt.problem.terms import (
     VelocityLimit,
 )
 from impactopt.problem.terms.grip import WRENCH
-from impactopt.problem.violation import Measure, Place, degrees, millimetres, percent
+from impactopt.problem.violation import Measure, Place, degrees, millimetres
 from impactopt.robots.tools import inside
 from impactopt.solvers.program import Determined
-
-__all__ = [
-    "DIRECTIONS",
-    "Affine",
-    "Array",
-    "ConstraintOrigin",
-    "Constraints",
-    "Group",
-    "Index",
-    "Layout",
-    "Limits",
-    "Measure",
-    "Place",
-    "Turn",
-    "add",
-    "along",
-    "by_choice",
-    "by_leg",
-    "degrees",
-    "determined",
-    "millimetres",
-    "percent",
-    "rates",
-    "select",
-    "stack",
-]
 
 Array = NDArray[np.float64]
 

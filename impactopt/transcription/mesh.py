@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact.targets import Target
 from impactopt.kinematics.splines import Radau
-from impactopt.kinematics.support import contact_wrench_cone
+from impactopt.kinematics.stance import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, PositionLimit, TorqueLimit
 from impactopt.robots.loads import MIN_LOAD_FRACTION, cop_margin, fading, margin_between_nodes, weight_of

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from impactopt.kinematics.splines import CubicSpline, basis, graded_breaks, knots, rate_weights
-from impactopt.kinematics.support import contact_wrench_cone
+from impactopt.kinematics.stance import contact_wrench_cone
 from impactopt.problem.problem import Phase
+from impactopt.problem.violation import Measure, Place, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact_state import Contact, ContactState
@@ -27,14 +28,11 @@ from impactopt.transcription.layout import (
     Array,
     Group,
     Index,
-    Measure,
-    Place,
     Turn,
     add,
     along,
     by_leg,
     determined,
-    percent,
     stack,
 )
 from impactopt.transcription.mesh import digits_of, percentage, with_middles
@@ -390,15 +388,13 @@ class MotionPhase:
         # the block divides by the weight, m * GRAVITY
         gravity = np.append(np.array(b.robot.model.gravity.linear) / GRAVITY, np.zeros(3))
         for s, out in list(zip(fractions, outputs, strict=True))[len(start) :]:
-            b.constraints.add(
-                term="momentum",
-                place=self.place_at(s),
-                components=DIRECTIONS,
-                outputs=out,
+            b.equal(
+                "momentum",
+                self.place_at(s),
+                DIRECTIONS,
+                out,
+                measure,
                 affine=-initial - stack([self.T[0]] * 6) * (s * gravity),
-                lower=0,
-                upper=0,
-                measure=measure,
             )
 
     # ------------------------------------------------------------------ numbers

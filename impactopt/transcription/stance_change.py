@@ -17,19 +17,10 @@ from itertools import pairwise
 import numpy as np
 
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.problem.violation import Place, millimetres, percent
 from impactopt.robots.loads import fading
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.layout import (
-    Affine,
-    Array,
-    Index,
-    Place,
-    millimetres,
-    percent,
-    rates,
-    select,
-    stack,
-)
+from impactopt.transcription.layout import Affine, Array, Index, rates, select, stack
 from impactopt.transcription.mesh import MoreNodes
 from impactopt.transcription.motion_phase import FREE, REST, MotionPhase, add_nodes, node_numbers
 from impactopt.transcription.plan import PlannedStand
@@ -189,16 +180,7 @@ class PhaseSequence:
         position = np.zeros(mine.base + b.robot.n, dtype=np.intp)
         position[np.append(np.arange(mine.base), mine.base + mine.independent)] = np.arange(mine.ny)
         shared = select(rate, np.append(position[: its.base], position[its.base + its.independent]))
-        b.constraints.add(
-            term=term,
-            place=place,
-            components=its.labels,
-            outputs=at[heavy],
-            affine=-shared,
-            lower=0,
-            upper=0,
-            measure=rates(its.labels),
-        )
+        b.equal(term, place, its.labels, at[heavy], rates(its.labels), affine=-shared)
         # The block ``node`` is evaluated again here: an output may be in one constraint only, and those of
         # the phases' own nodes are in others already.
         node = {
@@ -216,31 +198,20 @@ class PhaseSequence:
         freed = np.flatnonzero(~np.isin(its.dependent, mine.dependent))
         limit = b.robot.velocity_limit[its.dependent[freed]]
         labels = [its.leg_labels[k] for k in freed]
-        b.constraints.add(
-            term=term,
-            place=place,
-            components=labels,
-            outputs=legs[freed],
+        b.equal(
+            term,
+            place,
+            labels,
+            legs[freed],
+            percent("off"),
             affine=-select(rate, position[its.base + its.dependent[freed]]) * (1 / limit),
-            lower=0,
-            upper=0,
-            measure=percent("off"),
         )
         strong = percent("off its limit")
         names = [f"torque of {name}" for name in b.robot.joint_names]
         torque = b.lift(
             f"torque {place}", torques[heavy], term=term, place=place, labels=names, measure=strong
         )[0]
-        b.constraints.add(
-            term=term,
-            place=place,
-            components=names,
-            outputs=torques[light],
-            affine=-torque,
-            lower=0,
-            upper=0,
-            measure=strong,
-        )
+        b.equal(term, place, names, torques[light], strong, affine=-torque)
 
     def _rates(self, k: int, s: float) -> Index:
         """Indices (ny,) of block outputs: the rates y'/T of a phase at s."""

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.violation import Measure, Place
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -20,7 +20,7 @@ from impactopt.transcription.contact_conditions import add_balance, add_conditio
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
-from impactopt.transcription.layout import Affine, Array, Measure, Place, along, by_leg, rates
+from impactopt.transcription.layout import Affine, Array, along, by_leg, rates
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.motion_phase import add_nodes, at_node
 from impactopt.transcription.objective import Prices, wrench_prices
@@ -37,12 +37,11 @@ class StrikeTranscription(ContactProgram):
     def __init__(
         self,
         problem: ImpactProblem,
-        coordinates: StanceCoordinates,
         functions: dict[str, Any],
         elements: Elements = (),
         shares: Shares = (),
     ) -> None:
-        b, c = Builder(problem, coordinates, functions), coordinates
+        b, c = Builder(problem, functions), problem.coordinates
         add, limits = b.layout.add, b.limits
         self.y = add("posture at contact", 1, b.ny, **limits.of_y)
         self.legs = add("legs at contact", 1, b.nl, **limits.of_legs)

@@ -35,7 +35,7 @@ from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import solve_in_order
 from impactopt.kinematics.stages import Stage
 from impactopt.solvers.program import Determined
-from impactopt.transcription.batched import Block
+from impactopt.transcription.builder import Block
 from impactopt.transcription.layout import Affine, Array, Constraints, Index, Layout, stack
 
 

@@ -21,9 +21,10 @@ import numpy as np
 from impactopt.codegen.cache import FunctionGroup, cached_groups, model_hash
 from impactopt.contact.friction import moves_target
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import support_polygon
 from impactopt.problem.block import BlockExpression
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.violation import Place, degrees, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.blocks import ExtraBlock, extra_blocks, own_blocks, stance_blocks
 from impactopt.transcription.builder import Builder
@@ -34,19 +35,7 @@ from impactopt.transcription.contact_conditions import add_balance, add_clearanc
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, add_coasting
-from impactopt.transcription.layout import (
-    Affine,
-    Array,
-    Group,
-    Index,
-    Place,
-    Turn,
-    along,
-    degrees,
-    determined,
-    percent,
-    rates,
-)
+from impactopt.transcription.layout import Affine, Array, Group, Index, Turn, along, determined, rates
 from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares
 from impactopt.transcription.motion_phase import AbortMotion, FollowThrough, Swing, add_nodes
 from impactopt.transcription.objective import Prices, assemble, cost_of_motion, motion_prices
@@ -68,7 +57,6 @@ SECOND_BLOCKS = ("second_contact", "second_approach")
 
 def block_functions(
     problem: ImpactProblem,
-    coordinates: StanceCoordinates,
     report: Callable[[str], None] | None = None,
     elements: Elements = (),
 ) -> dict[str, Any]:
@@ -76,7 +64,7 @@ def block_functions(
 
     elements : of the contact, if not the problem's; the block of the peak force depends on them.
     """
-    robot = problem.robot
+    robot, coordinates = problem.robot, problem.coordinates
     edges = len(support_polygon(robot, coordinates))
     # `recipe` has what shapes every block, and `keys` what shapes single ones besides: the key of the cache
     recipe = (*_coordinates_recipe(coordinates), problem.striker, edges)
@@ -92,10 +80,9 @@ def block_functions(
     if chosen := problem.gain_joints:
         keys |= {name: (*keys.get(name, ()), chosen) for name in ("collision", "spring")}
     found = {
-        name: ExtraBlock(keys.get(name, ()), build)
-        for name, build in own_blocks(problem, coordinates, edges).items()
+        name: ExtraBlock(keys.get(name, ()), build) for name, build in own_blocks(problem, edges).items()
     }
-    found |= extra_blocks(problem, coordinates, elements)
+    found |= extra_blocks(problem, elements)
     blocks = [
         (f"{USER_PREFIX}{name}" if block.user else name, (*recipe, *block.key), block.build)
         for name, block in found.items()
@@ -152,13 +139,12 @@ class Transcription(ContactProgram):
     def __init__(
         self,
         problem: ImpactProblem,
-        coordinates: StanceCoordinates,
         functions: dict[str, Any],
         nodes: MoreNodes = NO_MORE,
         elements: Elements = (),
         shares: Shares = (),
     ) -> None:
-        b, self.nodes = Builder(problem, coordinates, functions), nodes
+        b, self.nodes = Builder(problem, functions), nodes
         # The phase with the impact is in both: its swing ends the first sequence, its follow-through begins
         # the second.
         before, after = range(problem.blow + 1), range(problem.blow, max(1, len(problem.stances)))
@@ -188,10 +174,11 @@ class Transcription(ContactProgram):
         add_clearance(b, self.swing, self.follow, self.hit.expected.target_state)
         self.hit.add_constraints()
         self._add_links()
-        if coordinates.drifts:  # after the links, whose constraints determine the start of the follow-through
+        # after the links, whose constraints determine the start of the follow-through
+        if problem.coordinates.drifts:
             self.swing.add_momentum_conservation(b)
             self.follow.add_momentum_conservation(b)
-        if coordinates.legs:
+        if b.coordinates.legs:
             y, y1, T = self.follow.start
             separation = [y, y1, self.follow.legs[0], T]
             self.angular_momentum = add_balance(b, contact.state, separation, self.hit.scenarios)

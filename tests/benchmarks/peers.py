@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.setup import Setup
 from impactopt.collision import Collision
-from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_start
-from impactopt.collision.runge_kutta import rate_of_change
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, rate_of_change, target_start
 from impactopt.simulation.mujoco_world import mujoco_module, no_log_file
 from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics

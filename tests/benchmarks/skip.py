@@ -19,9 +19,8 @@ from benchmarks.pictures.skip import skip_picture
 from benchmarks.report import Report, Say, columns_table
 from benchmarks.setup import Setup, run_of
 from impactopt.collision import SDC, Effects, JointFriction
-from impactopt.collision.graph import independent_joints, instructions, joint_space_model
+from impactopt.collision.graph import independent_joints, instructions, joint_space_model, rk4_step
 from impactopt.collision.outputs import HISTORIES, OF_SOLES
-from impactopt.collision.runge_kutta import rk4_step
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.robots.presets import standin

@@ -123,7 +123,7 @@ def _transcription(file: Path) -> Transcription:
     from impactopt.transcription.transcription import Transcription, block_functions
 
     problem = load_problem(file)
-    return Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
+    return Transcription(problem, block_functions(problem))
 
 
 def strike_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgram, Vector]:
@@ -134,8 +134,7 @@ def strike_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgram,
     from impactopt.transcription.transcription import block_functions
 
     problem = load_problem(file)
-    c = problem.coordinates
-    transcription = StrikeTranscription(problem, c, block_functions(problem, c))
+    transcription = StrikeTranscription(problem, block_functions(problem))
     return transcription.program, strike_iterate(transcription, **_drawn(seed, start))
 
 

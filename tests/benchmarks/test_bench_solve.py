@@ -264,7 +264,7 @@ def test_starts_are_plain_first_and_drawn_by_the_seed(
 ) -> None:
     functions = arm_transcription.functions
     monkeypatch.setattr("impactopt.files.problem_file.load_problem", lambda file: arm_problem())
-    monkeypatch.setattr("impactopt.transcription.transcription.block_functions", lambda problem, c: functions)
+    monkeypatch.setattr("impactopt.transcription.transcription.block_functions", lambda _: functions)
     start = lambda seed, k: solve.planning_program(Path("arm.toml"), seed, k)[1]  # noqa: E731
     plain = start(0, 0)
     np.testing.assert_array_equal(plain, start(5, 0))

@@ -184,7 +184,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
     its replay on fixed soles; cop_free_mm, force_free_N : least on free ones.  soles : all of these numbers,
     by sole and phase.
     missed_... : of the replay on free soles where the target is missing.
-    idle_travel_rad ... first_touch_ms : `impactopt.transcription.motion_measures`.
+    idle_travel_rad ... first_touch_ms : `impactopt.planning.solution`.
     gear_planned, gear_held, gear_free : load of the worst gear over its torque limit, None without armature.
     """
     out: dict[str, Any] = {"problem": name}

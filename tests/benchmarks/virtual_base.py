@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from benchmarks.pictures.virtual_base import virtual_base_picture
 from benchmarks.report import Report, Say, columns_table
 from impactopt.collision import SDC
-from impactopt.collision.graph import frozen_dynamics, joint_space_model
-from impactopt.collision.runge_kutta import rk4_step
-from impactopt.collision.runge_kutta import run as time_loop
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, rk4_step
+from impactopt.collision.graph import run as time_loop
 from impactopt.collision.stepped import number_of_steps
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import ConstrainedDynamics

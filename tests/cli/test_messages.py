@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from support.small_plans import changed
 
 from impactopt import ContactWrenchCone, Phase, Scenario, Status, TorqueLimit
+from impactopt.problem.violation import Measure, Place, degrees, millimetres, percent
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import DescribedProgram, Violation, explain, worst_violations
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.layout import Layout, Measure, Place, along, degrees, millimetres, percent
+from impactopt.transcription.layout import Layout, along
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

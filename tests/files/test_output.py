@@ -18,7 +18,7 @@ from impactopt import ImpactProblem, InputError, Plan, Status, load_record
 from impactopt.files.output import record_of, save_record, write_file
 from impactopt.files.record import FORMAT, Record
 from impactopt.files.record_schema import check_summary
-from impactopt.kinematics.support import margin
+from impactopt.kinematics.stance import margin
 from impactopt.report.pictures import PICTURES, save_pictures
 from impactopt.report.pictures.torque import _binned
 

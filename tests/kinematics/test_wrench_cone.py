@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from impactopt import InputError
-from impactopt.kinematics.support import contact_wrench_cone, margin, shrink, support_polygon, zmp
+from impactopt.kinematics.stance import contact_wrench_cone, margin, shrink, support_polygon, zmp
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**31)

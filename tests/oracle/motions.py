@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from impactopt.kinematics.splines import graded_breaks, knots
-from impactopt.kinematics.support import contact_wrench_cone
+from impactopt.kinematics.stance import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Phase
 from impactopt.problem.terms import (

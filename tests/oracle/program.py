@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.robot_bodies import striker_face
-from impactopt.kinematics.support import inward_edges, support_polygon
+from impactopt.kinematics.stance import inward_edges, support_polygon
 from impactopt.problem.objectives import (
     AngularMomentum,
     Effort,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.kinematics.splines import Radau
-from impactopt.kinematics.support import margin, support_polygon, zmp
+from impactopt.kinematics.stance import margin, support_polygon, zmp
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.terms import ContactWrenchCone
 from impactopt.robots.loads import SHARE, cop_margin, margin_between_nodes

@@ -39,7 +39,7 @@ from impactopt import (
     space_arm,
 )
 from impactopt.planning.clearance_constraints import Margins, Watch, node_placements
-from impactopt.robots.tendons import Tendon
+from impactopt.robots.couplings import Tendon
 from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription, statement_of
@@ -52,7 +52,7 @@ from oracle.verdict import claims_of
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
 ALLOWED = {"bodies", "contact", "errors", "kinematics", "problem", "robots"}
 # those of `kinematics` that are numbers alone
-NUMBERS = {"impactopt.kinematics.splines", "impactopt.kinematics.support"}
+NUMBERS = {"impactopt.kinematics.splines", "impactopt.kinematics.stance"}
 
 
 def test_it_shares_no_code_with_program_and_solver() -> None:

@@ -25,8 +25,7 @@ from impactopt import (
     solve,
 )
 from impactopt.bodies.clearance import Places
-from impactopt.planning import between_nodes
-from impactopt.planning.between_nodes import BetweenNodes
+from impactopt.planning import oracles
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import (
     Margins,
@@ -35,6 +34,7 @@ from impactopt.planning.clearance_constraints import (
     node_placements,
     same_bodies,
 )
+from impactopt.planning.oracles import BetweenNodes
 from impactopt.planning.refinement import Evaluation, Guess, Outcome
 from impactopt.planning.solve import PlanSolver
 from impactopt.solvers.program import max_violation
@@ -58,8 +58,7 @@ def with_peg(problem: ImpactProblem, x: float, z: float) -> ImpactProblem:
 
 
 def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
-    c = problem.coordinates
-    return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_clearance(
+    return Transcription(problem, block_functions(problem), solution.nodes).with_clearance(
         solution.clearance_constraints
     )
 
@@ -146,8 +145,8 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
             rows = {**Watch(t, margins, free.result.x).constraints(), **violated.constraints}
             assert violation(t.with_clearance(rows), free.result.x) > 1e-3
         else:
-            functions = block_functions(problem, problem.coordinates)
-            finer = Transcription(problem, problem.coordinates, functions, violated.nodes)
+            functions = block_functions(problem)
+            finer = Transcription(problem, functions, violated.nodes)
             there, _, _ = warm_start(finer, t, free.result.x, np.zeros(t.program.m), np.zeros(t.layout.n))
             rows = Watch(finer, margins, there).constraints()
             known = set(node_placements(t, free.result.x).names)
@@ -168,10 +167,10 @@ def test_rounds_end_with_bodies_that_are_apart(
     warm : the solutions' multipliers lead to the next one; else these guesses fail, and others follow.
     """
     if not warm:
-        monkeypatch.setattr(between_nodes, "_ITERATIONS_WARM", 5)
+        monkeypatch.setattr(oracles, "_ITERATIONS_WARM", 5)
     first, last = free.plan.swing_nodes[interval : interval + 2] * free.plan.swing.duration
     x, _, z = hammer(free, 0.35 * first + 0.65 * last)
-    problem, began, solved = with_peg(free.problem, x, z), list[float](), between_nodes.solve_with_clearance
+    problem, began, solved = with_peg(free.problem, x, z), list[float](), oracles.solve_with_clearance
 
     def watched(budget: Budget, margins: Margins, guess: Guess[Transcription]) -> Outcome[Transcription]:
         t = guess.program
@@ -179,7 +178,7 @@ def test_rounds_end_with_bodies_that_are_apart(
         began.append(violation(t.with_clearance(rows), guess.x))
         return solved(budget, margins, guess)
 
-    monkeypatch.setattr(between_nodes, "solve_with_clearance", watched)
+    monkeypatch.setattr(oracles, "solve_with_clearance", watched)
     solution = solve(problem)
     assert solution.status is Status.SOLVED and solution.nodes.total > 0
     assert solution.clearance()["clearance_mm"] > 0 and not solution.clearance()["contacts_besides"]

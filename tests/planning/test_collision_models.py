@@ -68,7 +68,7 @@ def planned(problem: ImpactProblem) -> tuple[StrikeTranscription, PlannedStrike]
         if shares is None:
             return t, t.decode(result.x)
         old, elements = t, contact_elements(problem, shares)
-        t = StrikeTranscription(problem, t.coordinates, t.functions, elements, shares)
+        t = StrikeTranscription(problem, t.functions, elements, shares)
         x = warm_start(t, old, result.x, result.multipliers, result.bound_multipliers)[0]
     pytest.fail("the shares of the phases do not settle")
 

@@ -111,8 +111,7 @@ def test_a_program_that_chooses_gains_has_the_rows_of_a_robot_that_has_them(
 
 
 def _program(problem: ImpactProblem) -> Transcription:
-    c = problem.coordinates
-    return Transcription(problem, c, block_functions(problem, c))
+    return Transcription(problem, block_functions(problem))
 
 
 @pytest.mark.slow

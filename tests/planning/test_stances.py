@@ -44,7 +44,7 @@ STEPS = (BOTH, StancePhase(soles=("left",)), dataclasses.replace(BOTH, steps=AHE
 
 
 def changed_nodes(program: Transcription, nodes: MoreNodes) -> Transcription:
-    return Transcription(program.problem, program.coordinates, program.functions, nodes)
+    return Transcription(program.problem, program.functions, nodes)
 
 
 def no_multipliers(program: Transcription) -> tuple[np.ndarray, np.ndarray]:

@@ -53,8 +53,8 @@ def with_stiffness(name: str, stiffness: float, *, ratio: bool = True) -> Impact
 
 def contact_of(problem: ImpactProblem) -> StrikeTranscription:
     """The program of its strike."""
-    functions = block_functions(problem, problem.coordinates)
-    return StrikeTranscription(problem, problem.coordinates, functions)
+    functions = block_functions(problem)
+    return StrikeTranscription(problem, functions)
 
 
 def diagnosed(problem: ImpactProblem) -> SolverResult:

@@ -44,7 +44,7 @@ from impactopt import (
 )
 from impactopt.cli.app import app
 from impactopt.files.problem_file import ProblemFile
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import support_polygon
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import optimize_strike
 from impactopt.solvers.program import check_program
@@ -66,7 +66,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def of_strike(t: Transcription) -> StrikeTranscription:
-    return StrikeTranscription(t.problem, t.coordinates, t.functions)
+    return StrikeTranscription(t.problem, t.functions)
 
 
 @pytest.fixture(params=[(robot, kind) for kind in VARIANTS for robot in ("biped", "arm")], ids=", ".join)

@@ -28,7 +28,7 @@ ITERATIONS = 7
 @pytest.fixture(scope="module")
 def strike(arm_transcription: Transcription) -> StrikeTranscription:
     t = arm_transcription
-    return StrikeTranscription(t.problem, t.coordinates, t.functions)
+    return StrikeTranscription(t.problem, t.functions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ def boxed(arm_transcription: Transcription, strike: StrikeTranscription) -> tupl
     elbow = data.oMi[model.getJointId("elbow")]
     box = Obstacle(name="box", size=(0.06, 0.06, 0.06), position=elbow.act(np.array([0.0, 0.07, 0.0])))
     of_box = changed(arm_transcription, obstacles=(box,))
-    return StrikeTranscription(of_box.problem, of_box.coordinates, of_box.functions), free.x
+    return StrikeTranscription(of_box.problem, of_box.functions), free.x
 
 
 @pytest.mark.parametrize(("solver", "options"), [("ipm", {}), ("sqp", {"qp_solver": "active_set"})])

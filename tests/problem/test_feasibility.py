@@ -31,7 +31,7 @@ from impactopt import (
 )
 from impactopt.cli.app import app
 from impactopt.files.draft.drafting import draft_problem
-from impactopt.kinematics.support import margin, support_polygon
+from impactopt.kinematics.stance import margin, support_polygon
 from impactopt.problem.feasibility import blocked, hopeless, sticks_out, unusual
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.strength import touches

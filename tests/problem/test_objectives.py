@@ -246,7 +246,7 @@ def test_the_peak_force_of_a_damped_contact_has_its_jump_at_first_touch(
 def test_the_smooth_maximum_of_a_half_sine(arm_transcription: Transcription) -> None:
     """At collocation points of three elements: as near to the largest as its docstring says."""
     problem = dataclasses.replace(arm_transcription.problem, objectives=(PeakForce(),))
-    peak = extra_blocks(problem, problem.coordinates)["peak"].build()
+    peak = extra_blocks(problem)["peak"].build()
     function = ca.Function("peak", [peak.z, peak.p], [peak.out])
     c = Radau.of_stages(3).c
     places = np.concatenate([0.5 * 0.2 * c, 0.1 + 0.5 * 0.8 * c, 0.5 + 0.5 * c])

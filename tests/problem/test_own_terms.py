@@ -17,11 +17,12 @@ from support.small_plans import changed
 from impactopt import Effort, Gaze, Impulse, InputError, Objective, Status, Term, TorqueLimit, write_problem
 from impactopt.planning.bounds import bounds_of
 from impactopt.planning.strike import optimize_strike
+from impactopt.problem.block import make_block
+from impactopt.problem.violation import millimetres
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.transcription.blocks import key_of, make_block
+from impactopt.transcription.blocks import key_of
 from impactopt.transcription.initial_guess import first_iterate, strike_iterate
-from impactopt.transcription.layout import millimetres
 from impactopt.transcription.objective import Quantity
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -139,7 +140,7 @@ def test_a_block_may_be_named_as_a_function_of_c(arm_transcription: Transcriptio
             return {"floor": height_of(self.frame, coordinates)}
 
     problem = replace(arm_transcription.problem, terms=(Floor(height=1.0),))
-    assert "floor_hess" in block_functions(problem, problem.coordinates)
+    assert "floor_hess" in block_functions(problem)
 
 
 def test_variables_with_a_name_that_is_taken_are_refused(arm_transcription: Transcription) -> None:
@@ -181,7 +182,7 @@ def test_squares_of_variables_are_weighed(arm_transcription: Transcription) -> N
 def test_a_strike_takes_what_says_something_of_it(arm_transcription: Transcription) -> None:
     own = {"terms": (Ceiling(height=2.0),), "objectives": (Impulse(), Strain(weight=1.0))}
     t = changed(arm_transcription, **own)
-    strike = StrikeTranscription(t.problem, t.coordinates, t.functions)
+    strike = StrikeTranscription(t.problem, t.functions)
     assert [o.name for o, _ in strike.objectives] == ["impulse"]
     names = [strike.program.constraint_name(i) for i in range(strike.program.m)]
     assert [name for name in names if name.startswith("ceiling")] == [

@@ -22,7 +22,7 @@ from impactopt import (
     Status,
     TorqueLimit,
 )
-from impactopt.kinematics.support import margin, zmp
+from impactopt.kinematics.stance import margin, zmp
 from impactopt.simulation import scene_of
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.transcription import contact_conditions as nlp

@@ -6,7 +6,7 @@ import pytest
 from support.rigid_body_cases import NAMES, case, configurations
 
 from impactopt import RigidBody
-from impactopt.robots.forward_kinematics import ForwardKinematics
+from impactopt.robots.model import ForwardKinematics
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -12,7 +12,7 @@ from support.small_plans import Planned, planned, transcribed
 
 from impactopt import ImpactProblem, InputError, PositionLimit, Robot
 from impactopt.files.verify import motion_of_record
-from impactopt.robots.tendons import Tendon
+from impactopt.robots.couplings import Tendon
 from impactopt.simulation import simulate
 
 mujoco = pytest.importorskip("mujoco")

@@ -23,7 +23,7 @@ from impactopt import (
     striking_velocity,
 )
 from impactopt.collision import Collision
-from impactopt.kinematics.support import margin
+from impactopt.kinematics.stance import margin
 from impactopt.simulation.cases import errors_against
 
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=5.0)

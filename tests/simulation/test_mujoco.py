@@ -25,7 +25,7 @@ from support.small_motions import (
 from support.small_robots import arm, biped, slider
 
 from impactopt import FreeMass, InputError, Perturbation, Robot, Solution, load_robot
-from impactopt.kinematics.support import margin
+from impactopt.kinematics.stance import margin
 from impactopt.simulation import Scene, Simulation, simulate, simulate_mujoco, simulate_pinocchio
 from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.mujoco_engine import _Replay

@@ -13,7 +13,7 @@ from support.small_motions import blow_motion, given_until, reference, scene, st
 from support.small_robots import arm, biped, slider
 
 from impactopt import InputError, Robot, load_problem, load_robot, solve
-from impactopt.kinematics.support import margin
+from impactopt.kinematics.stance import margin
 from impactopt.simulation import Scene, Simulation, simulate_pinocchio
 
 Array = NDArray[np.float64]

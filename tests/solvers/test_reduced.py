@@ -16,8 +16,8 @@ import impactopt.solvers.sqp.solver as solver_module
 from impactopt import Status
 from impactopt.files.named_problems import problem_file
 from impactopt.solvers.ipm import solve_ipm
+from impactopt.solvers.options import make_qp_solver
 from impactopt.solvers.program import Determined, TimedProgram
-from impactopt.solvers.qp.registry import make_qp_solver
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
 from impactopt.solvers.sqp.reduced_qp import QPStep, ReducedQP, Reduction, make_model
 

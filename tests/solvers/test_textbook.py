@@ -71,7 +71,7 @@ def test_convex_qps(name, solver):
     solution = make_qp_solver(solver).solve(qp)
     if not solution.usable:  # of all these, only our active-set method may fail, and on a singular P only
         assert (solver, solution.status) == ("active_set", QPStatus.FAILED)
-        assert np.linalg.cond(qp.P.toarray()) > 1e12
+        assert np.linalg.cond(qp.P) > 1e12
         return
     if solution.status is QPStatus.SOLVED:
         assert qp.error(solution.x, solution.y, solution.z) <= 1e-6

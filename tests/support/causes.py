@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from impactopt import ImpactProblem
 from impactopt.planning.budget import Budget
-from impactopt.planning.causes import Search, search
 from impactopt.planning.clearance_constraints import Margins, Watch
+from impactopt.planning.diagnosis import Search, search
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -20,7 +20,7 @@ def searched(problem: ImpactProblem, *, near: bool = False) -> tuple[Transcripti
 
     near : with clearance constraints for the bodies that are near each other in the initial guess.
     """
-    t = Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
+    t = Transcription(problem, block_functions(problem))
     if near:
         t = t.with_clearance(Watch(t, Margins(problem), first_iterate(t)).constraints())
     few = Budget(solver="ipm", options={"max_iterations": ITERATIONS}, time_limit=None, callback=None)

@@ -21,9 +21,9 @@ def quadratic(program: Textbook) -> QuadraticProgram:
     zero, no_multipliers = np.zeros(program.n), np.zeros(program.m)
     offset = program.constraints(zero)
     return QuadraticProgram(
-        P=program.hessian(zero, 1.0, no_multipliers),
+        P=program.hessian(zero, 1.0, no_multipliers).toarray(),
         q=program.gradient(zero),
-        A=program.jacobian(zero),
+        A=program.jacobian(zero).toarray(),
         lower=program.g_lower - offset,
         upper=program.g_upper - offset,
         x_lower=program.x_lower,

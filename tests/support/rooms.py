@@ -42,7 +42,7 @@ NUMERIC = (
     "kinematics/operational_space.py",
     "kinematics/inverse_kinematics.py",
     "kinematics/splines.py",
-    "kinematics/support.py",
+    "kinematics/stance.py",
     "planning/clearance_constraints.py",
     "planning/solution.py",
     "simulation",

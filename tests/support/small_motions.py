@@ -15,7 +15,7 @@ from scipy.integrate import cumulative_trapezoid
 from impactopt import FreeMass, Robot, SpringDamper
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import static_wrenches
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.stance import support_polygon
 from impactopt.simulation import Scene, Simulation, simulate_pinocchio
 from support.small_robots import biped, slider
 

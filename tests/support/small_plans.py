@@ -21,7 +21,6 @@ from impactopt import (
     Term,
     Trajectory,
 )
-from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
@@ -72,16 +71,12 @@ def arm_problem() -> ImpactProblem:
 
 
 def transcribed(problem: ImpactProblem) -> Transcription:
-    return Transcription(problem, *_shared(problem))
+    return Transcription(problem, block_functions(problem))
 
 
 def struck(problem: ImpactProblem) -> StrikeTranscription:
     """The problem's strike."""
-    return StrikeTranscription(problem, *_shared(problem))
-
-
-def _shared(problem: ImpactProblem) -> tuple[StanceCoordinates, dict[str, Any]]:
-    return problem.coordinates, block_functions(problem, problem.coordinates)
+    return StrikeTranscription(problem, block_functions(problem))
 
 
 def changed(transcription: Transcription, **changes: Any) -> Transcription:

@@ -37,8 +37,7 @@ from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.files.sections.reading import CollisionFile
 from impactopt.kinematics.operational_space import ConstrainedDynamics
-from impactopt.kinematics.stance import Stance
-from impactopt.kinematics.support import margin
+from impactopt.kinematics.stance import Stance, margin
 from impactopt.report.console import collision_table
 from impactopt.report.result_rows import collision_rows, contact_rows
 from impactopt.sweeps import sweep_from_data

@@ -58,7 +58,7 @@ def test_stages_written_with_stages_and_solved_for() -> None:
 @pytest.fixture(scope="module")
 def blocks() -> dict[str, Callable[[], BlockExpression]]:
     problem = biped_problem()
-    return own_blocks(problem, problem.coordinates, 4)
+    return own_blocks(problem, 4)
 
 
 @pytest.mark.parametrize("name", ["node", "collision", "balance"])

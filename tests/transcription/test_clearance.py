@@ -395,8 +395,7 @@ def test_a_solution_is_a_start_in_another_world_too(free: Solution, barred: Solu
 
 
 def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
-    c = problem.coordinates
-    return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_clearance(
+    return Transcription(problem, block_functions(problem), solution.nodes).with_clearance(
         solution.clearance_constraints
     )
 

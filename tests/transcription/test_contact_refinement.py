@@ -187,9 +187,7 @@ def test_elements_are_cut_where_their_errors_are() -> None:
 
 def test_finer_elements_start_where_the_old_ones_ended(biped_plan: Planned) -> None:
     old, result = biped_plan.transcription, biped_plan.result
-    new = Transcription(
-        old.problem, old.coordinates, old.functions, old.nodes, halved(contact_elements(old.problem))
-    )
+    new = Transcription(old.problem, old.functions, old.nodes, halved(contact_elements(old.problem)))
     x, y, z = warm_start(new, old, result.x, result.multipliers, result.bound_multipliers)
     g = new.program.constraints(x)
     assert np.maximum(new.program.g_lower - g, g - new.program.g_upper).max() < 0.2
@@ -211,7 +209,7 @@ def test_finer_elements_start_where_the_old_ones_ended(biped_plan: Planned) -> N
 def test_a_scenario_may_be_called_like_a_phase(transcription: Transcription) -> None:
     t = changed(transcription, scenarios=(Scenario(name="swing heavier", mass=8.0),))
     x, none = first_iterate(t), (np.zeros(t.program.m), np.zeros(t.program.n))
-    new = Transcription(t.problem, t.coordinates, t.functions, elements=halved(t.hit.elements))
+    new = Transcription(t.problem, t.functions, elements=halved(t.hit.elements))
     found = warm_start(new, t, x, *none)[0]
     group, known = (p.layout.groups["swing heavier: contact force"] for p in (new, t))
     assert group.count > known.count and np.isfinite(group.read(found)).all()
@@ -220,7 +218,7 @@ def test_a_scenario_may_be_called_like_a_phase(transcription: Transcription) -> 
 def test_the_old_contact_is_a_warm_start(transcription: Transcription) -> None:
     t = changed(transcription, collision_elements=((0.25,) * 4, (0.25,) * 4))
     first = solve_ipm(t.program, first_iterate(t))
-    new = Transcription(t.problem, t.coordinates, t.functions, elements=halved(t.hit.elements))
+    new = Transcription(t.problem, t.functions, elements=halved(t.hit.elements))
     x, y, z = warm_start(new, t, first.x, first.multipliers, first.bound_multipliers)
     again = solve_ipm(new.program, x, multipliers=y, bound_multipliers=z)
     assert again.status is Status.SOLVED and again.iterations < first.iterations

@@ -38,7 +38,7 @@ from impactopt import (
 )
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
-from impactopt.planning import between_nodes
+from impactopt.planning import oracles
 from impactopt.planning import solution as solutions
 from impactopt.planning.solve import solve
 from impactopt.problem.objectives import OBJECTIVES
@@ -167,7 +167,7 @@ def finer(t: Transcription) -> Transcription:
     nodes = MoreNodes(
         swing=tuple(middles(t.swing_nodes)[[1, -1]]), follow=tuple(middles(t.follow_nodes)[[0]])
     )
-    return Transcription(t.problem, t.coordinates, t.functions, nodes)
+    return Transcription(t.problem, t.functions, nodes)
 
 
 def test_a_program_with_more_nodes_starts_where_the_old_one_ended(biped_plan: Planned) -> None:
@@ -395,5 +395,5 @@ def test_a_plan_that_cannot_be_checked_is_not_lost(coarse: Any, monkeypatch: pyt
     def unreachable(*_: Any) -> MoreNodes:
         raise InputError("a leg does not reach")
 
-    monkeypatch.setattr(between_nodes, "nodes_to_add", unreachable)
+    monkeypatch.setattr(oracles, "nodes_to_add", unreachable)
     assert solve(coarse).status is Status.SOLVED

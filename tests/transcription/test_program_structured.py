@@ -17,7 +17,7 @@ from impactopt.codegen.batched import pattern
 from impactopt.kinematics.stages import Stage
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import NonlinearProgram
-from impactopt.transcription.batched import Block
+from impactopt.transcription.builder import Block
 from impactopt.transcription.layout import Affine, Constraints, Layout, select, stack
 from impactopt.transcription.structured import StructuredProgram, derivative_functions
 

@@ -244,7 +244,7 @@ def test_a_program_in_lanes_is_the_program(cache: Path, monkeypatch: pytest.Monk
     with monkeypatch.context() as without:
         without.setenv("IMPACTOPT_NO_COMPILER", "1")
         plain = transcribed(problem)
-    fast = Transcription(problem, problem.coordinates, compiled(*plain.functions.values()))
+    fast = Transcription(problem, compiled(*plain.functions.values()))
     rng = np.random.default_rng(1)
     x = first_iterate(plain) + 0.01 * rng.standard_normal(plain.program.n)
     multipliers = rng.standard_normal(plain.program.m)

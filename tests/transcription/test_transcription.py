@@ -28,7 +28,7 @@ from impactopt import (
     VelocityLimit,
 )
 from impactopt.kinematics.splines import Radau
-from impactopt.kinematics.support import contact_wrench_cone, zmp
+from impactopt.kinematics.stance import contact_wrench_cone, zmp
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import check_program
 from impactopt.transcription.contact_conditions import rotation_rows
@@ -405,7 +405,7 @@ def test_the_simulated_ground_wrench_is_the_planned_one(biped_plan: Planned) -> 
 def test_a_better_bounded_problem_gives_less(arm_plan: Planned) -> None:
     """Half the torque cannot hit harder."""
     problem = dataclasses.replace(arm_plan.problem, terms=(TorqueLimit(fraction=0.4, collision=0.4),))
-    weaker = Transcription(problem, problem.coordinates, arm_plan.transcription.functions)
+    weaker = Transcription(problem, arm_plan.transcription.functions)
     result = solve_ipopt(weaker.program, arm_plan.result.x)
     assert result.status is Status.SOLVED
     plan = weaker.decode(result.x)
@@ -433,7 +433,7 @@ def test_what_cannot_be_met_is_named(arm_plan: Planned) -> None:
     slow = dataclasses.replace(
         arm_plan.problem, terms=(VelocityLimit(fraction=0.02),), swing=Phase(duration=0.1, intervals=8)
     )
-    transcription = Transcription(slow, slow.coordinates, arm_plan.transcription.functions)
+    transcription = Transcription(slow, arm_plan.transcription.functions)
     result = solve_ipopt(transcription.program, first_iterate(transcription))
     assert result.status is Status.INFEASIBLE
     assert "Constraints that cannot be met" in result.message

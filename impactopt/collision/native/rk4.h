@@ -1,4 +1,4 @@
-/* Steps of the classical Runge-Kutta method; see collision/runge_kutta.py. */
+/* Steps of the classical Runge-Kutta method; see collision/graph.py. */
 
 typedef struct {
   vec torque[V], deviation[V], torque2[V];

@@ -19,11 +19,17 @@ import numpy as np
 
 from impactopt.collision.checks import LEAST_PIVOT
 from impactopt.collision.frozen import FrozenDynamics
-from impactopt.collision.graph import MOST_STEPS, columns_of, joint_space_model, target_start
+from impactopt.collision.graph import (
+    BLOCK,
+    LEFT_OUT_BY_RK4,
+    MOST_STEPS,
+    columns_of,
+    joint_space_model,
+    target_start,
+)
 from impactopt.collision.implicit import CONTROL, NODES, STAGES, gamma, tables
 from impactopt.collision.model import GIVES_WAY, JointSpaceModel, cuts, shape_of
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
-from impactopt.collision.runge_kutta import BLOCK, LEFT_OUT_BY_RK4
 from impactopt.collision.stepped import (
     SteppedModel,
     contact_functions,
@@ -370,7 +376,7 @@ def _blocks(collision: SteppedModel, fraction: float) -> int:
     """Largest number of steps in a fraction of the horizon, in whole blocks."""
     if collision.stepping == "implicit":
         return MOST_STEPS
-    # as `runge_kutta.run` does, so that the histories have as many columns
+    # as `graph.run` does, so that the histories have as many columns
     return -(-number_of_steps(collision, fraction) // BLOCK) * BLOCK
 
 

@@ -17,8 +17,9 @@ from impactopt.robots.build import (
     velocity_limit,
 )
 from impactopt.robots.checks import MAX_SERVO_RATE
-from impactopt.robots.couplings import Coupling, axis_of, couplings_of
+from impactopt.robots.couplings import Coupling, couplings_of
 from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
+from impactopt.robots.model import axis_of
 
 # by joint type: True for a revolute joint, False for a prismatic one
 SPEED = {True: 3.0, False: 0.3}  # guessed velocity limit [rad/s], [m/s]

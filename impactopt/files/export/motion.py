@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BPoly, PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from impactopt.kinematics.support import zmp
+from impactopt.kinematics.stance import zmp
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
 

@@ -82,7 +82,7 @@ class PositionLimit(Term):
 class ContactWrenchCone(Term):
     """Each sole's wrench lies in the cone of its corners: centre of pressure, friction and torsion.
 
-    Source: Caron et al. 2015, see :mod:`impactopt.kinematics.support`. The cone bounds friction, centre
+    Source: Caron et al. 2015, see :mod:`impactopt.kinematics.stance`. The cone bounds friction, centre
     of pressure and yaw torsion of each sole together: where friction or pressure use it up, less torsion is
     left. So there are no terms for one of them alone.
     """

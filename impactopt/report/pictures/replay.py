@@ -9,7 +9,7 @@ from matplotlib.figure import FigureBase
 from matplotlib.lines import Line2D
 
 from impactopt.files.record import Record
-from impactopt.kinematics.support import zmp
+from impactopt.kinematics.stance import zmp
 from impactopt.report.pictures.style import BLACK, GREEN, ORANGE, PHASES, Array, picture
 from impactopt.report.pictures.zmp import draw_soles
 from impactopt.robots.loads import MIN_LOAD_FRACTION

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from impactopt.files.record import Record
-from impactopt.kinematics.support import zmp
+from impactopt.kinematics.stance import zmp
 from impactopt.report.histories import footprints
 from impactopt.report.pictures.style import BLACK, OVER, PHASES, RIGHT, Array, picture, simulated_parts
 

@@ -11,13 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError
 from impactopt.robots.rigid_body import _dynamics
-from impactopt.robots.rigid_body._dynamics import (
-    Accelerations,
-    Factor,
-    Kinematics,
-    Velocities,
-    tree_entries,
-)
+from impactopt.robots.rigid_body._dynamics import Accelerations, Factor, Kinematics, Velocities, tree_entries
 from impactopt.robots.rigid_body._spatial import (
     Scalar,
     Vector,

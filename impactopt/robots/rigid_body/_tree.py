@@ -22,8 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean, shortened
 from impactopt.robots.checks import check_configuration
-from impactopt.robots.couplings import axis_of
-from impactopt.robots.model import JointAngles
+from impactopt.robots.model import JointAngles, axis_of
 from impactopt.robots.rigid_body._spatial import (
     IDENTITY,
     Matrix,

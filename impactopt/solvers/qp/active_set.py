@@ -35,7 +35,7 @@ class ActiveSetSolver:
         time_limit: float | None = None,
     ) -> QPSolution:
         """Solve the QP from the active set of the initial guess (x, y, z)."""
-        (P, C), (_, lower, upper) = qp.arrays, qp.stacked
+        P, (C, lower, upper) = qp.P, qp.stacked
         size = qp.m + qp.n
         failure = QPSolution(
             x=np.zeros(qp.n), y=np.zeros(qp.m), z=np.zeros(qp.n), status=QPStatus.FAILED, iterations=0

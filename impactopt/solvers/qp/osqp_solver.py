@@ -139,11 +139,7 @@ class OsqpSolver:
 
     def _load(self, qp: QuadraticProgram, C: Any, lower: Vector, upper: Vector) -> bool:
         """Set up OSQP, or update it in place for the same patterns; False if it refuses."""
-        if qp.dense:
-            P, C = sp.csc_matrix(np.triu(qp.P)), sp.csc_matrix(C)
-        else:
-            P = sp.csc_matrix(sp.triu(qp.P, format="csc"))
-            P.sort_indices()
+        P, C = sp.csc_matrix(np.triu(qp.P)), sp.csc_matrix(C)
         pattern = [P.indptr, P.indices, C.indptr, C.indices]
         if self._solver is not None and all(map(np.array_equal, pattern, self._pattern)):
             self._solver.update(q=qp.q, l=lower, u=upper)

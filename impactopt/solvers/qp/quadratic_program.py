@@ -6,17 +6,14 @@ Source of the refinement: Hintermueller, Ito, Kunisch, SIAM Journal on Optimizat
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import scipy.linalg as la
-import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
-from impactopt.solvers.program import Matrix, Vector, row_norms
+from impactopt.solvers.program import Vector, row_norms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,16 +22,16 @@ class QuadraticProgram:
 
     Attributes
     ----------
-    P : full symmetric, positive semidefinite (n, n): csc_array; or a dense array, as A, if the QP is small.
+    P : full symmetric, positive semidefinite (n, n), dense.
     q : (n,).
-    A : (m, n), as P.
+    A : (m, n), dense.
     lower, upper : (m,), equal for equalities, +-inf for none.
     x_lower, x_upper : (n,), likewise.
     """
 
-    P: Matrix
+    P: np.ndarray
     q: Vector
-    A: Matrix
+    A: np.ndarray
     lower: Vector
     upper: Vector
     x_lower: Vector
@@ -50,33 +47,15 @@ class QuadraticProgram:
         """Number of constraints: rows of A, without the variables' bounds."""
         return int(self.lower.size)
 
-    @property
-    def dense(self) -> bool:
-        """True if its matrices are dense arrays."""
-        return isinstance(self.A, np.ndarray)
-
     @cached_property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """P, and C of `stacked`, as dense arrays."""
-        C = self.stacked[0]
-        return (self.P, C) if self.dense else (self.P.toarray(), C.toarray())
-
-    @cached_property
-    def stacked(self) -> tuple[Any, Vector, Vector]:
+    def stacked(self) -> tuple[np.ndarray, Vector, Vector]:
         """Normalized constraints l <= C x <= u: (C, l, u); C = [A; I] with rows of norm 1, or zero.
 
         First-order solvers depend on the norms of the rows. `row_scale` times their multipliers are those of
         the QP.
         """
-        if self.dense:
-            # Bounds have norm 1 already.
-            C: Any = np.vstack([self.row_scale[: self.m, None] * self.A, np.eye(self.n)])
-        else:
-            C = sp.csc_array(
-                sp.diags_array(self.row_scale)
-                @ sp.vstack([self.A, sp.diags_array(np.ones(self.n))], format="csc")
-            )
-            C.sort_indices()
+        # Bounds have norm 1 already.
+        C = np.vstack([self.row_scale[: self.m, None] * self.A, np.eye(self.n)])
         lower = np.concatenate([self.lower, self.x_lower]) * self.row_scale
         upper = np.concatenate([self.upper, self.x_upper]) * self.row_scale
         return C, lower, upper
@@ -156,7 +135,6 @@ class QPSolver(Protocol):
         ...
 
 
-_DENSE = 400  # up to this many unknowns LAPACK is quicker than a sparse factorization
 _REGULARIZATION = 1e-9  # on the diagonal of a KKT system, against dependent constraints
 
 
@@ -184,7 +162,6 @@ def refine(qp: QuadraticProgram, x: Vector, y: Vector, *, rounds: int = 10) -> R
     The best point found; None if no active set gave a system that could be solved.
     """
     C, lower, upper = qp.stacked
-    rows = C if qp.dense else C.tocsr()
     best: Refined | None = None
     # Corrections may cycle: an active set that was tried before ends them.
     seen: set[bytes] = set()
@@ -197,7 +174,7 @@ def refine(qp: QuadraticProgram, x: Vector, y: Vector, *, rounds: int = 10) -> R
         seen.add(key)
         active = np.flatnonzero(high | low)
         target = np.where(high[active], upper[active], lower[active])
-        solved = solve_equality_qp(qp.P, qp.q, rows[active], target)
+        solved = solve_equality_qp(qp.P, qp.q, C[active], target)
         if solved is None:
             break
         x, y = solved[0], np.zeros(lower.size)
@@ -224,33 +201,19 @@ def active_set(qp: QuadraticProgram, x: Vector, y: Vector) -> np.ndarray:
     return np.where(high, 1, np.where(y + (v - lower) < 0, -1, 0))
 
 
-def solve_equality_qp(P: Matrix, q: Vector, A: Matrix, b: Vector) -> tuple[Vector, Vector] | None:
+def solve_equality_qp(P: np.ndarray, q: Vector, A: np.ndarray, b: Vector) -> tuple[Vector, Vector] | None:
     """Minimize 1/2 x'Px + q'x subject to A x = b, also dependent: x and multipliers; None if singular."""
     n, m = q.size, b.size
-    K: Any
-    if isinstance(A, np.ndarray):
-        K = np.zeros((n + m, n + m))
-        K[:n, :n], K[n:, :n], K[:n, n:] = P, A, A.T
-    else:
-        K = sp.csc_array(sp.block_array([[P, A.T], [A, None]] if m else [[P]], format="csc"))
-    # Plus for variables, minus for multipliers: quasidefinite, see below.
-    shift = _REGULARIZATION * np.concatenate([np.ones(n), -np.ones(m)])
+    K = np.zeros((n + m, n + m))
+    K[:n, :n], K[n:, :n], K[:n, n:] = P, A, A.T
     right = np.concatenate([-q, b])
-    if n + m <= _DENSE or isinstance(K, np.ndarray):
-        whole = K.copy() if isinstance(K, np.ndarray) else K.toarray()
-        whole[np.diag_indices(n + m)] += shift
-        lu, pivots, info = la.lapack.dgetrf(whole, overwrite_a=True)
-        if info != 0:
-            return None
-        solve: Callable[[Vector], Vector] = lambda r: la.lapack.dgetrs(lu, pivots, r)[0]  # noqa: E731
-    else:
-        try:
-            solve = spla.splu(sp.csc_matrix(K + sp.diags_array(shift))).solve
-        except RuntimeError:  # singular
-            return None
     # The shift makes the system quasidefinite, and so regular also for dependent constraints; refinement with
     # the true matrix removes its effect.
-    s = solve(right)
+    shift = _REGULARIZATION * np.concatenate([np.ones(n), -np.ones(m)])
+    lu, pivots, info = la.lapack.dgetrf(K + np.diag(shift), overwrite_a=True)
+    if info != 0:
+        return None
+    s = la.lapack.dgetrs(lu, pivots, right)[0]
     for _ in range(5):
-        s = s + solve(right - K @ s)
+        s = s + la.lapack.dgetrs(lu, pivots, right - K @ s)[0]
     return (s[:n], s[n:]) if np.isfinite(s).all() else None

@@ -1,8 +1,7 @@
 """Sequential quadratic programming: reduced QPs by QP solvers, large ones by the interior-point method."""
 
-from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.options import QP_SOLVERS, SQPOptions, make_qp_solver
 from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatus, QuadraticProgram
-from impactopt.solvers.qp.registry import QP_SOLVERS, make_qp_solver
 from impactopt.solvers.sqp.solver import solve_sqp
 
 __all__ = [

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.options import SQPOptions, make_qp_solver
 from impactopt.solvers.program import (
     Point,
     Status,
@@ -26,7 +26,6 @@ from impactopt.solvers.program import (
     constraint_violations,
     stationarity,
 )
-from impactopt.solvers.qp.registry import make_qp_solver
 from impactopt.solvers.run import Run
 from impactopt.solvers.sqp.reduced_qp import QPStep, ReducedModel, ReducedQP, Reduction, make_model
 

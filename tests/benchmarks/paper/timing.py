@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from benchmarks.clock import medians, runner
 from impactopt.codegen.cache import cached, model_hash
 from impactopt.collision import SDC
-from impactopt.collision.graph import frozen_dynamics, joint_space_model
-from impactopt.collision.runge_kutta import rk4_step
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, rk4_step
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 

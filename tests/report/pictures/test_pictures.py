@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 from impactopt import FreeMass, Ground, InputError, Phase, Solution, effective_mass, load_problem, solve
 from impactopt.files.output import record_of
 from impactopt.files.record import Record
-from impactopt.kinematics.support import zmp
+from impactopt.kinematics.stance import zmp
 from impactopt.report.charts import charts_of
 from impactopt.report.pictures import PICTURES, hierarchy, overview
 from impactopt.report.pictures.compare import comparison_picture

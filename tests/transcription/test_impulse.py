@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
-from support.small_plans import LAW, OPTIONS, Planned, changed, planned
+from support.small_plans import LAW, Planned, changed, planned
 
 from impactopt import (
     FreeMass,
@@ -220,7 +220,7 @@ def in_soles_axes(problem: ImpactProblem, q: Array, wrench: Array) -> Array:
 def solved(request: pytest.FixtureRequest) -> Planned:
     who, kind = request.param
     transcription = changed(request.getfixturevalue(f"{who}_transcription"), **KINDS[kind])
-    return planned(transcription, OPTIONS)
+    return planned(transcription)
 
 
 def contact_state(plan: Plan) -> tuple[Array, Array, Array]:

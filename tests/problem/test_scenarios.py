@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
-from support.small_plans import LAW, Planned, changed, planned
+from support.small_plans import LAW, Planned, changed, planned, solution_of
 
 from impactopt import (
     Balance,
     ContactWrenchCone,
     FreeMass,
     Scenario,
-    Solution,
     SpringDamper,
     Status,
     TorqueLimit,
@@ -199,15 +197,7 @@ def test_rows_of_a_scenario_say_so(biped: Planned) -> None:
 
 
 def test_the_summary_has_the_scenarios(biped: Planned) -> None:
-    solution = Solution(
-        problem=biped.problem,
-        plan=biped.plan,
-        result=biped.result,
-        solver="ipopt",
-        build_seconds=0.0,
-        solve_seconds=0.0,
-        violations=(),
-    )
+    solution = solution_of(biped)
     summary = json.loads(json.dumps(solution.summary()))
     assert [s["name"] for s in summary["scenarios"]] == ["as expected", "heavy"]
     same, heavy = summary["scenarios"]

@@ -18,6 +18,7 @@ from impactopt import (
     Plan,
     Robot,
     SelfCollision,
+    Solution,
     SpringDamper,
     Term,
     Trajectory,
@@ -114,6 +115,19 @@ def planned(transcription: Transcription, scene: Scene | None = None) -> Planned
     plan = transcription.decode(result.x)
     scene = scene or scene_of(problem)
     return Planned(problem, transcription, start, result, plan, plan.trajectory(), scene)
+
+
+def solution_of(planned: Planned) -> Solution:
+    """The plan as users get it."""
+    return Solution(
+        problem=planned.problem,
+        plan=planned.plan,
+        result=planned.result,
+        solver="ipm",
+        build_seconds=0.0,
+        solve_seconds=0.0,
+        violations=(),
+    )
 
 
 def rod_hammer(problem: ImpactProblem) -> ImpactProblem:

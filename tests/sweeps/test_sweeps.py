@@ -84,7 +84,7 @@ def test_ctrl_c_and_a_worker_that_is_killed_cost_nothing_and_the_table_tells_all
             assert victim.pid is not None
             os.kill(victim.pid, signal.SIGKILL)
 
-    result = sweep(SWEEP, tmp_path / "out", workers=2, progress=kill_one)
+    result = sweep(SWEEP, tmp_path / "out", workers=1, progress=kill_one)
     assert rows(result.table) == undisturbed
     assert (result.cases, result.done, result.failed, result.resumed) == (4, 4, failures(undisturbed), 1)
     assert [now.done for now in told] == [2, 3, 4] and told[-1].remaining == 0

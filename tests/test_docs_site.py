@@ -44,8 +44,8 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site as `make docs` builds it, without garbage collection, a quarter of its time; what it warns of is an
-    error.
+    """The site as `make docs` builds it, but without garbage collection, a quarter of its time; warnings are
+    errors.
     """
     out = tmp_path_factory.mktemp("site")
     build = "import gc, sys; gc.disable(); from sphinx.cmd.build import main; sys.exit(main(sys.argv[1:]))"

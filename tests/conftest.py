@@ -6,6 +6,8 @@ import gc
 import os
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: tests run on all cores as it is
+
 import pytest
 from support.small_plans import Planned, arm_problem, biped_problem, planned, transcribed
 

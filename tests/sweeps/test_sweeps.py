@@ -222,7 +222,8 @@ def test_a_case_that_does_not_stop_is_ended(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.slow
-def test_workers_have_one_blas_thread() -> None:
+def test_workers_have_one_blas_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)  # conftest's
     assert dict(each_on_workers(pools, None, [(0, 0)], workers=1)) == {0: 1}
 
 

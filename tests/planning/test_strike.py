@@ -69,7 +69,9 @@ def of_strike(t: Transcription) -> StrikeTranscription:
     return StrikeTranscription(t.problem, t.coordinates, t.functions)
 
 
-@pytest.fixture(params=[(robot, kind) for kind in VARIANTS for robot in ("biped", "arm")], ids=", ".join)
+@pytest.fixture(
+    scope="module", params=[(robot, kind) for kind in VARIANTS for robot in ("biped", "arm")], ids=", ".join
+)
 def transcription(request: pytest.FixtureRequest) -> StrikeTranscription:
     robot, kind = request.param
     return of_strike(changed(request.getfixturevalue(f"{robot}_transcription"), **VARIANTS[kind]))

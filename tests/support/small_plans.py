@@ -25,7 +25,7 @@ from impactopt import (
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
-from impactopt.solvers.ipm.interior_point import solve_ipm
+from impactopt.solvers.ipm.interior_point import IPMOptions, solve_ipm
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.strike import StrikeTranscription
@@ -34,6 +34,7 @@ from support.small_robots import arm, biped, striking_point
 
 Array = NDArray[np.float64]
 LAW = SpringDamper(stiffness=1e4, damping=300.0)
+EXACT = IPMOptions(complementarity_tolerance=1e-7)  # bounds that are active are so to a millionth
 STEP = 5e-4  # [s] of simulations
 # for tests of something else, where a robot's boxes are in the way or cost time
 BODILESS: tuple[Term, ...] = (SelfCollision(enabled=False), KeepOut(enabled=False))
@@ -111,7 +112,7 @@ def planned(transcription: Transcription, scene: Scene | None = None) -> Planned
     """Solved, to be simulated; ``scene``: if not the problem's."""
     problem = transcription.problem
     start = first_iterate(transcription)
-    result = solve_ipm(transcription.program, start)
+    result = solve_ipm(transcription.program, start, options=EXACT)
     plan = transcription.decode(result.x)
     scene = scene or scene_of(problem)
     return Planned(problem, transcription, start, result, plan, plan.trajectory(), scene)

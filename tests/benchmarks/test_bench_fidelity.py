@@ -135,7 +135,7 @@ def made_up(errors: dict[int | None, list[float | None]]) -> list[dict[str, Any]
     return out
 
 
-@pytest.mark.parametrize("name", ["standin", pytest.param("g1", id="g1")])
+@pytest.mark.parametrize("name", ["standin", pytest.param("g1", marks=pytest.mark.slow)])
 def test_the_collisions_are_what_the_bench_says(name: str) -> None:
     cases = situations(name)
     assert len({case.name for case in cases}) == len(MASS_RATIOS) * len(PAPER_SPEEDS) * len(GAINS) == 27

@@ -158,7 +158,7 @@ def random_pair(seed: int, near: float) -> tuple[Separations, Array]:
 
 
 @pytest.mark.parametrize("near", [0.03, 0.005, -0.004])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_derivatives_agree_with_differences(seed: int, near: float) -> None:
     of, z = random_pair(seed, near)
     g, h, step = gradient(of, z), hessian(of, z, -2.5), 1e-6
@@ -170,7 +170,7 @@ def test_derivatives_agree_with_differences(seed: int, near: float) -> None:
         np.testing.assert_allclose(h[k], -2.5 * difference, atol=1e-5 * np.abs(h).max() + 1e-6)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("size", [1e-3, 0.05, 0.5])
 def test_a_search_that_begins_where_derivatives_foresee_finds_the_same_distance(
     seed: int, size: float

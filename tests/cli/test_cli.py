@@ -88,8 +88,8 @@ def planner(monkeypatch: pytest.MonkeyPatch, problem: ImpactProblem) -> Planner:
 
 
 @pytest.fixture(autouse=True)
-def quick_pictures(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """Empty files in place of pictures; test_output draws them, and here `real_pictures`."""
+def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Empty files in place of pictures, which test_output draws."""
 
     def save(record: Record, directory: Path) -> list[Path]:
         paths = [directory / f"{name}.png" for name in PICTURES]
@@ -97,13 +97,7 @@ def quick_pictures(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureReque
             path.touch()
         return paths
 
-    if "real_pictures" not in request.fixturenames:
-        monkeypatch.setattr("impactopt.report.pictures.save_pictures", save)
-
-
-@pytest.fixture
-def real_pictures() -> None:
-    """Pictures are drawn."""
+    monkeypatch.setattr("impactopt.report.pictures.save_pictures", save)
 
 
 @pytest.fixture
@@ -121,7 +115,6 @@ def run(*arguments: object, code: int = 0) -> tuple[str, str]:
     return result.stdout, result.stderr
 
 
-@pytest.mark.usefixtures("real_pictures")
 def test_solve_prints_planned_beside_simulated_and_writes_everything(
     planner: Planner, file: Path, tmp_path: Path
 ) -> None:

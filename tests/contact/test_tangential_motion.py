@@ -73,11 +73,11 @@ KINDS = pytest.mark.parametrize("kind", [FullDynamics, MujocoDynamics, SDC, Virt
 
 
 @KINDS
-@pytest.mark.parametrize("across", [6.0, -6.0])
-def test_a_box_that_slides_all_along_gets_mu_times_the_impulse(kind: Any, across: float) -> None:
-    rough = dataclasses.replace(MOVES, slip_speed=1e-3)
+def test_a_box_that_slides_all_along_gets_mu_times_the_impulse(kind: Any) -> None:
+    """Against the axis; along it, boxes stick in the next test."""
+    across, rough = -6.0, dataclasses.replace(MOVES, slip_speed=1e-3)
     found = on_a_box(across, rough, kind)
-    push = np.sign(across) * 0.6 * found.impulse
+    push = -0.6 * found.impulse
     rel = 1e-4 if kind is MujocoDynamics else 1e-6
     assert found.tangential_velocity == pytest.approx([0.0, push / MASS, 0.0], rel=rel)
     assert found.velocity[1] == pytest.approx(across - push / 2.0, rel=rel)

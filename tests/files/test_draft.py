@@ -357,10 +357,10 @@ def test_what_is_drafted_is_sound(tmp_path: Path, text: str) -> None:
     [
         ({"legs": 7}, None),
         ({"waist": True}, None),
-        ({"legs": 7, "waist": True}, None),
+        pytest.param({"legs": 7, "waist": True}, None, marks=pytest.mark.slow),
         ({"without": "ankle_roll"}, "x"),
         ({"without": "hip_yaw"}, "z"),
-        ({"without": "ankle_roll", "waist": True}, "x"),
+        pytest.param({"without": "ankle_roll", "waist": True}, "x", marks=pytest.mark.slow),
     ],
     ids=["seven", "waist", "seven and waist", "no ankle roll", "no hip yaw", "five and waist"],
 )

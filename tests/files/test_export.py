@@ -102,7 +102,7 @@ def still() -> Solution:
 
 
 def replayed(
-    problem: ImpactProblem, reference: Any, *, step: float = 2e-4, settle: float = 0.0
+    problem: ImpactProblem, reference: Any, *, step: float = 4e-4, settle: float = 0.0
 ) -> Simulation:
     return simulate_mujoco(
         problem.robot, reference, scene_of(problem), step=step, settle=settle, perturbation=SERVO

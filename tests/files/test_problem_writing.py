@@ -77,11 +77,10 @@ def test_every_problem_of_the_package_comes_back(name: str) -> None:
     assert_same(back(text), problem)
     again = parse_problem_file(text, Path("written.toml"))
     assert again.solver == read.solver
-    assert write_problem(problem, solver=read.solver) == text
     # nothing stands there that could be left out
     data = read_toml(text)
     for term, keys in data.get("terms", {}).items():
-        section = type(parse_problem_file(text, Path("x.toml")).content.terms).model_fields[term].annotation
+        section = type(again.content.terms).model_fields[term].annotation
         assert issubclass(section, Section)
         fields = {info.alias or n: n for n, info in section.model_fields.items()}
         assert all(section.defaults().get(fields[key]) != value for key, value in keys.items())
@@ -231,8 +230,9 @@ def test_terms_that_only_some_problems_have_come_back(nailing: ImpactProblem, na
     robot = nailing.robot.with_actuators({"wrist": motor})
     for term in (CASES[name].tight, CASES[name].mild):
         problem = dataclasses.replace(nailing, terms=(term,), robot=robot)
-        assert_same(back(write_problem(problem)), problem)
-        assert back(write_problem(problem)).terms == (term,)
+        again = back(write_problem(problem))
+        assert_same(again, problem)
+        assert again.terms == (term,)
 
 
 def test_motors_of_all_joints_but_a_soft_grip_come_back(nailing: ImpactProblem) -> None:

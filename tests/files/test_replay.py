@@ -26,18 +26,27 @@ from impactopt.report.pictures.animation import AROUND, FPS, SLOW, _Drawing, sav
 from impactopt.simulation.result import REPORT
 
 FLAT = REPORT[:13]  # numbers for the whole motion; after them, what is by phase or by sole
-PUNCH = Path(__file__).resolve().parents[2] / "problems" / "punch.toml"
+ARM = problem_file("arm_planar")
 QUICK = ("--step", "5e-4", "--settle", "1.0")
+BRIEF = ("--step", "2e-4", "--settle", "0")
 
 runner = CliRunner()
 
 
-@pytest.fixture(scope="module")
-def saved(punch: Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def saved_as_solved(solution: Solution, file: Path, folder: Path) -> Path:
     """What `impactopt solve` leaves, without its replays."""
-    directory = tmp_path_factory.mktemp("results") / "punch"
-    save_record(record_of(punch, problem=PUNCH.read_text("utf-8"), problem_path=PUNCH), directory)
-    return directory
+    save_record(record_of(solution, problem=file.read_text("utf-8"), problem_path=file), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def punched(punch: Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return saved_as_solved(punch, problem_file("punch"), tmp_path_factory.mktemp("results") / "punch")
+
+
+@pytest.fixture(scope="module")
+def saved(hammered: Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return saved_as_solved(hammered, ARM, tmp_path_factory.mktemp("results") / "arm")
 
 
 def resaved(saved: Path, directory: Path, **changes: Any) -> Path:
@@ -54,8 +63,8 @@ def run(*arguments: object, code: int = 0) -> tuple[str, str]:
 
 
 @pytest.mark.slow
-def test_json_is_the_flat_report(saved: Path, punch: Solution, tmp_path: Path) -> None:
-    out, _ = run(saved, "--json", "--out", tmp_path / "new" / "place", *QUICK)
+def test_json_is_the_flat_report(punched: Path, punch: Solution, tmp_path: Path) -> None:
+    out, _ = run(punched, "--json", "--out", tmp_path / "new" / "place", *QUICK)
     report = json.loads(out)
     assert tuple(report) == ("ok", *REPORT, "controller")
     assert report["engine"] == "mujoco" and report["standing"] is True and report["reason"] == ""
@@ -71,16 +80,16 @@ def test_json_is_the_flat_report(saved: Path, punch: Solution, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_held_soles_cannot_say_whether_it_stands(saved: Path) -> None:
-    out, _ = run(saved / "solution.npz", "--engine", "pinocchio", "--json", "--step", "5e-4")
+def test_held_soles_cannot_say_whether_it_stands(punched: Path) -> None:
+    out, _ = run(punched / "solution.npz", "--engine", "pinocchio", "--json", "--step", "5e-4")
     report = json.loads(out)
     assert report["standing"] is None and "fixed" in report["reason"]
     assert abs(report["impulse_error_pct"]) < 2
 
 
 @pytest.mark.slow
-def test_a_missed_blow_is_replayed_on_held_soles_too(saved: Path) -> None:
-    out, _ = run(saved, "--engine", "pinocchio", "--missing", "--json", "--step", "5e-4")
+def test_a_missed_blow_is_replayed_on_held_soles_too(punched: Path) -> None:
+    out, _ = run(punched, "--engine", "pinocchio", "--missing", "--json", "--step", "5e-4")
     report = json.loads(out)
     assert report["impulse_Ns"] == 0 and report["impulse_error_pct"] is None
     assert report["torque_ratio_by_phase"].keys() == report["zmp_margin_by_phase_m"].keys()
@@ -91,19 +100,19 @@ def test_a_missed_blow_is_replayed_on_held_soles_too(saved: Path) -> None:
 def test_an_unsolved_plan_and_a_blow_that_does_not_hit_are_said(hammered: Solution, tmp_path: Path) -> None:
     record = record_of(hammered, problem=problem_file("arm_planar").read_text("utf-8"))
     save_record(record, tmp_path)
-    assert "not hit" not in run(tmp_path, "--step", "1e-4")[0]
+    assert "not hit" not in run(tmp_path, *BRIEF)[0]
     bad = {**record.summary, "status": "time_limit", "message": "Stopped at the time limit."}
     save_record(dataclasses.replace(record, summary=bad), tmp_path)
-    out, _ = run(tmp_path, "--distance", 0.2, "--step", "1e-4")
+    out, _ = run(tmp_path, "--distance", 0.2, *BRIEF)
     assert out.splitlines()[-2:] == ["Stopped at the time limit.", "the target is not hit"]
 
 
 @pytest.mark.slow
-def test_a_fall_exits_1_and_says_when(saved: Path) -> None:
-    out, _ = run(saved, "--payload", 30, "--missing", "--step", "1e-3", code=1)
+def test_a_fall_exits_1_and_says_when(punched: Path) -> None:
+    out, _ = run(punched, "--payload", 30, "--missing", "--step", "1e-3", code=1)
     assert "stands at the end" in out and "! no" in out
     assert "-100" not in out and "impulse error" not in out, "nothing is hit, so nothing is wrong about it"
-    out, _ = run(saved, "--payload", 30, "--missing", "--step", "1e-3", "--json", code=1)
+    out, _ = run(punched, "--payload", 30, "--missing", "--step", "1e-3", "--json", code=1)
     report = json.loads(out)
     assert report["reason"].startswith("fell: ") and " at t = " in report["reason"]
     assert report["impulse_Ns"] == 0 and report["standing"] is False
@@ -139,13 +148,13 @@ def test_a_result_without_its_problem_file_asks_for_it(saved: Path, tmp_path: Pa
     lonely = resaved(saved, tmp_path / "lonely", problem="", problem_path=None)
     with pytest.raises(InputError, match="holds no problem file: give it with --problem FILE"):
         load_planned(lonely)
-    planned = load_planned(lonely, problem_file=PUNCH)
-    assert planned.problem.robot.name == "talos"
+    planned = load_planned(lonely, problem_file=ARM)
+    assert planned.problem.robot.name == "planar_arm"
     np.testing.assert_array_equal(planned.reference.q, load_record(saved).arrays["reference_q"])
 
 
 def test_a_urdf_that_has_moved_is_one_clear_error(saved: Path, tmp_path: Path) -> None:
-    text = PUNCH.read_text("utf-8").replace('robot = "talos"', "#") + '\n[robot]\nurdf = "gone.urdf"\n'
+    text = ARM.read_text("utf-8").replace('robot = "planar_arm"', "#") + '\n[robot]\nurdf = "gone.urdf"\n'
     moved = resaved(saved, tmp_path / "results", problem=text, problem_path=tmp_path / "problems" / "my.toml")
     with pytest.raises(InputError, match=r"problems/gone\.urdf(.|\n)*--problem FILE"):
         load_planned(moved)
@@ -155,13 +164,13 @@ def test_a_plan_of_another_robot_is_refused(saved: Path, tmp_path: Path) -> None
     arrays = dict(load_record(saved).arrays)
     arrays["joints"] = arrays["joints"][::-1]
     other = resaved(saved, tmp_path / "other", arrays=arrays)
-    with pytest.raises(InputError, match="planned for other joints than those of the robot 'talos'"):
+    with pytest.raises(InputError, match="planned for other joints than those of the robot 'planar_arm'"):
         load_planned(other)
 
 
 def test_a_problem_that_has_changed_since_its_plan_is_told(saved: Path, tmp_path: Path) -> None:
     """As by another URDF under the same name: a replay's error would be taken for the plan's."""
-    text = PUNCH.read_text("utf-8").replace("mass_kg = 5.0", "mass_kg = 5.5")
+    text = ARM.read_text("utf-8").replace("mass_kg = 0.05", "mass_kg = 0.055")
     heavier = resaved(saved, tmp_path / "heavier", problem=text)
     with pytest.warns(
         UserWarning, match="heavier is another one today .* after a change of its robot's files"

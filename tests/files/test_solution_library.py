@@ -33,12 +33,22 @@ def solution() -> Solution:
     return solve(arm().build(), refine=False)
 
 
-@pytest.fixture
-def folder(solution: Solution, tmp_path: Path) -> SolvedFolder:
-    folder = SolvedFolder(tmp_path / "solved")
+def two_kept(solution: Solution, path: Path) -> SolvedFolder:
+    folder = SolvedFolder(path)
     folder.keep(solution, arm(), "plain")
     folder.keep(solution, arm(contact__stiffness_N_m=1e6), "stiff")
     return folder
+
+
+@pytest.fixture
+def folder(solution: Solution, tmp_path: Path) -> SolvedFolder:
+    return two_kept(solution, tmp_path / "solved")
+
+
+@pytest.fixture(scope="module")
+def library(solution: Solution, tmp_path_factory: pytest.TempPathFactory) -> SolvedFolder:
+    """To be read only."""
+    return two_kept(solution, tmp_path_factory.mktemp("library"))
 
 
 @pytest.mark.parametrize(
@@ -52,9 +62,9 @@ def folder(solution: Solution, tmp_path: Path) -> SolvedFolder:
     ],
 )
 def test_the_nearest_is_found(
-    folder: SolvedFolder, settings: dict[str, Any], name: str, distance: float
+    library: SolvedFolder, settings: dict[str, Any], name: str, distance: float
 ) -> None:
-    near = folder.nearest(arm(**settings))
+    near = library.nearest(arm(**settings))
     assert near is not None and near.path.name == name
     assert near.distance == pytest.approx(distance, abs=1e-3)
 
@@ -69,8 +79,8 @@ def test_the_nearest_is_found(
     ],
     ids=lambda settings: next(iter(settings)),
 )
-def test_what_is_far_or_of_another_kind_is_none(folder: SolvedFolder, settings: dict[str, Any]) -> None:
-    assert folder.nearest(arm(**settings)) is None
+def test_what_is_far_or_of_another_kind_is_none(library: SolvedFolder, settings: dict[str, Any]) -> None:
+    assert library.nearest(arm(**settings)) is None
 
 
 @pytest.mark.slow

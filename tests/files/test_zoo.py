@@ -217,7 +217,7 @@ def test_an_arm_plans_and_both_engines_replay_it() -> None:
         swing=Phase(duration=0.4, intervals=6),
         follow=Phase(duration=0.6, intervals=6),
     )
-    done = planned(transcribed(problem), {"tol": 1e-6})
+    done = planned(transcribed(problem))
     assert done.result.status.usable and done.plan.impulse > 1.0
     assert done.simulation.impulse == pytest.approx(done.plan.impulse, rel=0.02)
     free = simulate(problem, done.trajectory, engine="mujoco", settle=0.2)

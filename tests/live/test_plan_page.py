@@ -60,8 +60,8 @@ LONG = 60.0  # [s]
 
 
 @pytest.fixture(scope="module")
-def arm() -> Solution:
-    return solve(load_problem(FILE), refine=False)
+def arm(hammered: Solution) -> Solution:
+    return hammered
 
 
 @pytest.fixture

@@ -23,12 +23,13 @@ def test_no_mesh_is_in_another_from_start_to_rest_or_after_a_miss(punch: Solutio
         assert meshes.touching(punch.plan.motion(missed=missed).q) == []
 
 
-def test_the_meshes_know_what_is_in_each_other(punch: Solution) -> None:
+def test_the_meshes_know_what_is_in_each_other() -> None:
     """A forearm turned through the pelvis is found: what never fails would say nothing."""
-    robot, q = punch.problem.robot, punch.problem.start_posture.copy()
+    problem = load_problem("punch")
+    robot, q = problem.robot, problem.start_posture.copy()
     for joint in ("arm_left_4_joint", "arm_left_2_joint"):
         q[robot.model.joints[robot.model.getJointId(joint)].idx_q] = 0.0
-    meshes = Meshes(robot, punch.problem.start_posture)
+    meshes = Meshes(robot, problem.start_posture)
     assert any("arm_left" in one or "arm_left" in two for one, two in meshes.touching(q[None]))
 
 
@@ -52,6 +53,7 @@ def test_nor_in_another_problem() -> None:
         assert meshes.touching(solution.plan.motion(missed=missed).q) == []
 
 
+@pytest.mark.slow
 def test_the_summary_says_so(punch: Solution) -> None:
     said = punch.clearance()
     assert said["contacts_besides"] == [] and said["clearance_mm"] > 0 and " and " in said["nearest"]

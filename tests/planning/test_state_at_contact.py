@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from support.exact import ExactCollision
 from support.frozen_cases import slider
 from support.native_cases import LAW, X, call, native, robot_named, situation
-from support.small_plans import Planned
+from support.small_plans import Planned, solution_of
 from typer.testing import CliRunner
 
 from impactopt import (
@@ -261,13 +261,14 @@ def struck(name: str) -> StrikeSolution:
 
 
 def contact_of(
-    kind: str, name: str, punch: Solution
+    kind: str, name: str, request: pytest.FixtureRequest
 ) -> tuple[ImpactProblem, Any, Any, Any, PlannedCollision]:
     """Problem, q, v and torque at contact, and what the plan says of it."""
     if kind == "strike":
         strike = struck(name).strike
         return struck(name).problem, strike.posture, strike.velocity, strike.torque, strike.collision
-    solution = punch if name == "punch" else solved(name)
+    shared = {"punch": "punch", "arm_planar": "hammered"}
+    solution = request.getfixturevalue(shared[name]) if name in shared else solved(name)
     ref = solution.trajectory
     last = int(np.flatnonzero(ref.phase == 0)[-1])
     return solution.problem, ref.q[last], ref.v[last], ref.torque[last], solution.plan.collision
@@ -333,10 +334,12 @@ def test_a_result_has_one_answer(name: str, kind: str, tmp_path: Path, punch: So
 
 
 @pytest.mark.parametrize("kind", ["solve", "strike"])
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_torques_of_a_plan_are_those_of_full_dynamics(name: str, kind: str, punch: Solution) -> None:
+@pytest.mark.parametrize("name", ["arm_planar", "chop_arm", pytest.param("punch", marks=pytest.mark.slow)])
+def test_torques_of_a_plan_are_those_of_full_dynamics(
+    name: str, kind: str, request: pytest.FixtureRequest
+) -> None:
     """Of each joint, at the plan's collocation points."""
-    problem, q, v, torque, hit = contact_of(kind, name, punch)
+    problem, q, v, torque, hit = contact_of(kind, name, request)
     bend = coasting_reference(problem.coordinates, q, v, until=2 * hit.time[-1])
     full = FullDynamics(**scene_at(problem), step=1e-4).collide(q, v, torque, **bend)
     at = hit.time < full.time[-1]
@@ -348,9 +351,9 @@ def test_torques_of_a_plan_are_those_of_full_dynamics(name: str, kind: str, punc
 @pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("kind", ["solve", "strike"])
-def test_what_is_left_is_the_models_own(kind: str, tmp_path: Path, punch: Solution) -> None:
+def test_what_is_left_is_the_models_own(kind: str, request: pytest.FixtureRequest) -> None:
     """Of the demo's punch: force, ZMP and torque at all times; errors fall with the number of freezes."""
-    problem, q, v, torque, hit = contact_of(kind, "punch", punch)
+    problem, q, v, torque, hit = contact_of(kind, "punch", request)
     scene = scene_at(problem)
     bend = coasting_reference(problem.coordinates, q, v, until=2 * hit.time[-1])
     full = FullDynamics(**scene, step=1e-4).collide(q, v, torque, **bend)
@@ -379,9 +382,9 @@ def test_what_is_left_is_the_models_own(kind: str, tmp_path: Path, punch: Soluti
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
-def test_a_slower_result_bends_the_same_way(tmp_path: Path, punch: Solution) -> None:
-    problem, ref = punch.problem, punch.trajectory
-    save_record(record_of(punch), tmp_path)
+def test_a_slower_result_bends_the_same_way(tmp_path: Path, biped_plan: Planned) -> None:
+    problem, ref = biped_plan.problem, biped_plan.trajectory
+    save_record(record_of(solution_of(biped_plan)), tmp_path)
     states = ContactStates(
         robot=problem.robot,
         striker=problem.striker,
@@ -394,7 +397,7 @@ def test_a_slower_result_bends_the_same_way(tmp_path: Path, punch: Solution) -> 
     whole = states.compute(posture, {}, None, problem.normal, 1)
     scaled = states.compute(posture, {}, 0.8 * whole.speed, problem.normal, 1)
     c, last = problem.coordinates, int(np.flatnonzero(ref.phase == 0)[-1])
-    anew = coasting_reference(c, ref.q[last], 0.8 * ref.v[last], until=2 * punch.plan.collision.time[-1])
+    anew = coasting_reference(c, ref.q[last], 0.8 * ref.v[last], until=2 * biped_plan.plan.collision.time[-1])
     time = np.linspace(0, 0.05, 6)[:, None, None]
     orders = np.arange(1, REFERENCE_ORDER + 1)
     gained, again = (

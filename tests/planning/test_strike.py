@@ -69,7 +69,9 @@ def of_strike(t: Transcription) -> StrikeTranscription:
     return StrikeTranscription(t.problem, t.functions)
 
 
-@pytest.fixture(params=[(robot, kind) for kind in VARIANTS for robot in ("biped", "arm")], ids=", ".join)
+@pytest.fixture(
+    scope="module", params=[(robot, kind) for kind in VARIANTS for robot in ("biped", "arm")], ids=", ".join
+)
 def transcription(request: pytest.FixtureRequest) -> StrikeTranscription:
     robot, kind = request.param
     return of_strike(changed(request.getfixturevalue(f"{robot}_transcription"), **VARIANTS[kind]))
@@ -413,15 +415,14 @@ def test_a_motion_starts_from_the_strikes_state_at_contact(robot_plan: Planned) 
     assert np.abs(t.u0.read(plain) - t.u0.read(start)).max() > 0.1
 
 
-@pytest.mark.parametrize("start", ["reach", "strike"])
 def test_a_motion_is_solved_from_several_starts(
-    arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch, start: str
+    arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     t = arm_transcription
     monkeypatch.setattr("impactopt.planning.solution.block_functions", lambda *_: t.functions)
-    found = solve(t.problem, start=start, starts=2)
+    found = solve(t.problem, start="strike", starts=2)
     assert found.status is Status.SOLVED
-    assert [attempt.start for attempt in found.attempts] == [f"{start} 1", f"{start} 2"]
+    assert [attempt.start for attempt in found.attempts] == ["strike 1", "strike 2"]
     assert found.result.objective == min(a.objective for a in found.attempts if a.status.usable)
     assert found.clearance()["contacts_besides"] == []
     told = found.summary()["starts"]

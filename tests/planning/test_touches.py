@@ -54,13 +54,20 @@ def stiff(stiffness: float = 1e6, **changes: Any) -> ImpactProblem:
     return dataclasses.replace(load_problem("chop_arm"), **{"law": law, "terms": terms, **changes})
 
 
-@pytest.fixture(scope="module", params=[(1e6, None), (1e7, 2)])
+@pytest.fixture(scope="module", params=[pytest.param((1e6, None), marks=pytest.mark.slow), (1e7, 2)])
 def chopped(request: pytest.FixtureRequest) -> Solution:
     stiffness, touches = request.param
     return solve(stiff(stiffness, touches=touches))
 
 
-@pytest.fixture(scope="module", params=[(KelvinVoigt, 1e7), (KelvinVoigt, 1e8), (SpringDamper, 1e7)])
+@pytest.fixture(
+    scope="module",
+    params=[
+        (KelvinVoigt, 1e8),
+        (SpringDamper, 1e7),
+        pytest.param((KelvinVoigt, 1e7), marks=pytest.mark.slow),
+    ],
+)
 def swung(request: pytest.FixtureRequest) -> Solution:
     law, stiffness = request.param
     return solve(stiff(law=law(stiffness=stiffness, damping=50.0)))

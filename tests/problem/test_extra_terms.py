@@ -29,6 +29,7 @@ from impactopt import (
     TorqueRate,
 )
 from impactopt.bodies.world import face_axes
+from impactopt.solvers.ipm.interior_point import solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
@@ -38,7 +39,7 @@ Array = NDArray[np.float64]
 
 
 def solve(t: Transcription) -> SolverResult:
-    return solve_ipopt(t.program, first_iterate(t))
+    return solve_ipm(t.program, first_iterate(t))
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_loosening_a_term_that_binds_raises_the_optimum(solved: Any, name: str) 
     """From the tight one's plan: there are several local optima."""
     tight = solved(CASES[name].tight)
     looser = changed(tight.transcription, terms=(CASES[name].loose,))
-    loose = solve_ipopt(looser.program, tight.result.x)
+    loose = solve_ipm(looser.program, tight.result.x)
     assert loose.status is Status.SOLVED
     assert tight.result.objective > loose.objective + 1e-4
     program, term = tight.transcription.program, CASES[name].tight.name
@@ -157,7 +158,8 @@ def test_derivatives_with_all_terms_agree_with_differences(
 def test_what_cannot_be_met_names_term_and_time(arm_transcription: Transcription) -> None:
     """A hand that cannot be turned so far."""
     turned = HandOrientation(axis=(0, 0, 1), angle=0.6)
-    result = solve(changed(arm_transcription, terms=(turned,)))
+    t = changed(arm_transcription, terms=(turned,))
+    result = solve_ipopt(t.program, first_iterate(t))
     assert result.status is Status.INFEASIBLE
     assert "hand orientation, contact, hand: " in result.message and " deg too far off" in result.message
 

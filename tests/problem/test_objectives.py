@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
-from support.small_plans import OPTIONS, Planned, arm_problem, changed
+from support.small_plans import Planned, arm_problem, changed
 
 from impactopt import (
     AngularMomentum,
@@ -30,7 +30,7 @@ from impactopt import (
     TargetEnergy,
 )
 from impactopt.kinematics.splines import Radau
-from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.ipm.interior_point import solve_ipm
 from impactopt.transcription.blocks import extra_blocks
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription
@@ -39,8 +39,8 @@ Array = NDArray[np.float64]
 ALL = (Impulse(), PeakForce(), TargetEnergy(), Penetration(), Effort())
 
 
-def solved(transcription: Transcription, start: Array, **options: Any) -> tuple[Array, Plan]:
-    result = solve_ipopt(transcription.program, start, options=options)
+def solved(transcription: Transcription, start: Array) -> tuple[Array, Plan]:
+    result = solve_ipm(transcription.program, start)
     assert result.status is Status.SOLVED
     return result.x, transcription.decode(result.x)
 
@@ -119,7 +119,7 @@ def test_angular_momentum_is_kept_small(biped_transcription: Transcription, bipe
     """Beside the impulse, and squared in the program: what the follow-through starts with."""
     objectives = (Impulse(), AngularMomentum(weight=1.0))
     transcription = changed(biped_transcription, objectives=objectives)
-    x, plan = solved(transcription, first_iterate(transcription), **OPTIONS)
+    x, plan = solved(transcription, first_iterate(transcription))
     before, after = momentum_after_contact(biped_plan.plan), momentum_after_contact(plan)
     assert transcription.achieved(x)[AngularMomentum.name] == pytest.approx(after @ after, rel=1e-4)
     assert after @ after < 0.9 * (before @ before)

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
-from support.small_plans import LAW, OPTIONS, Planned, changed, planned
+from support.small_plans import LAW, Planned, changed, planned, solution_of
 
 from impactopt import (
     Balance,
     ContactWrenchCone,
     FreeMass,
     Scenario,
-    Solution,
     SpringDamper,
     Status,
     TorqueLimit,
@@ -37,7 +35,7 @@ MISSING = Scenario(name="missing", missing=True, capture_margin=0.03)
 HARD = Scenario(name="hard", stiffness=2.0, damping=0.5)
 
 
-def comes(transcription: Transcription, scenario: Scenario, options: dict[str, Any]) -> Planned:
+def comes(transcription: Transcription, scenario: Scenario) -> Planned:
     """The plan, and the simulation of the scenario in full dynamics."""
     scene = scene_of(transcription.problem)
     law, target = scene.law, scene.target
@@ -49,17 +47,17 @@ def comes(transcription: Transcription, scenario: Scenario, options: dict[str, A
         ),
         target=FreeMass(mass=scenario.mass * target.mass),
     )
-    return planned(transcription, options, scene)
+    return planned(transcription, scene)
 
 
 @pytest.fixture(scope="module")
 def biped(biped_transcription: Transcription) -> Planned:
-    return comes(changed(biped_transcription, scenarios=(EXPECTED, HEAVY, MISSING)), HEAVY, OPTIONS)
+    return comes(changed(biped_transcription, scenarios=(EXPECTED, HEAVY, MISSING)), HEAVY)
 
 
 @pytest.fixture(scope="module")
 def arm(arm_transcription: Transcription) -> Planned:
-    return comes(changed(arm_transcription, scenarios=(HEAVY, HARD, EXPECTED)), HARD, {})
+    return comes(changed(arm_transcription, scenarios=(HEAVY, HARD, EXPECTED)), HARD)
 
 
 @pytest.fixture(params=["biped", "arm"])
@@ -199,15 +197,7 @@ def test_rows_of_a_scenario_say_so(biped: Planned) -> None:
 
 
 def test_the_summary_has_the_scenarios(biped: Planned) -> None:
-    solution = Solution(
-        problem=biped.problem,
-        plan=biped.plan,
-        result=biped.result,
-        solver="ipopt",
-        build_seconds=0.0,
-        solve_seconds=0.0,
-        violations=(),
-    )
+    solution = solution_of(biped)
     summary = json.loads(json.dumps(solution.summary()))
     assert [s["name"] for s in summary["scenarios"]] == ["as expected", "heavy"]
     same, heavy = summary["scenarios"]

@@ -445,6 +445,7 @@ def test_the_world_moves_on_a_page_as_it_does_in_pictures(
     assert page["tips"] == [True] * 2
 
 
+@pytest.mark.slow
 def test_a_robots_bodies_are_drawn_over_it(shown: list[dict[str, Any]]) -> None:
     page = shown[1]
     assert page["wide"] and page["readout"] == "posture: half_sitting" and page["sliders"] == 0

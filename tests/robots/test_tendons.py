@@ -108,7 +108,7 @@ def test_a_plan_keeps_a_tendon_in_its_range(arm_plan: Planned) -> None:
     problem, margin = tied(free, upper), free.term(PositionLimit).margin
     assert problem.hash != free.hash
     assert any("cord" in line for line in problem.describe()["tendons"])
-    plan = planned(transcribed(problem), {})
+    plan = planned(transcribed(problem))
     assert plan.result.status.usable
     t = plan.transcription
     nodes = np.array([t.posture(plan.result.x, slots) for _, slots in t.body_spots])

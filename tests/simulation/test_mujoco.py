@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.fake_solution import still_problem, still_solution
 from support.small_motions import (
     blow_motion,
     given_until,
@@ -562,8 +563,8 @@ def test_the_demos_punch_stands_on_its_own_feet(punch: Solution) -> None:
     assert sim.posture_error < 0.05
 
 
-def test_engines_by_name_refuse_what_they_do_not_have(punch: Solution) -> None:
-    problem, motion = punch.problem, punch.trajectory
+def test_engines_by_name_refuse_what_they_do_not_have() -> None:
+    problem, motion = still_problem(), still_solution().trajectory
     with pytest.raises(InputError, match=r"unknown engine 'mujco' \(did you mean 'mujoco'"):
         simulate(problem, motion, engine="mujco")
     with pytest.raises(InputError, match="no perturbation; take engine 'mujoco'"):
@@ -585,21 +586,19 @@ def test_engines_by_name_refuse_what_they_do_not_have(punch: Solution) -> None:
         ("mujoco", {"missed": True}, "missed must be a Trajectory, not True"),
     ],
 )
-def test_options_of_engines_are_checked(
-    punch: Solution, engine: str, options: dict[str, Any], text: str
-) -> None:
+def test_options_of_engines_are_checked(engine: str, options: dict[str, Any], text: str) -> None:
     with pytest.raises(InputError, match=text):
-        simulate(punch.problem, punch.trajectory, engine=engine, **options)
+        simulate(still_problem(), still_solution().trajectory, engine=engine, **options)
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
-def test_a_replay_ends_where_it_is_told_to(punch: Solution, engine: str) -> None:
-    end = 0.5 * punch.trajectory.contact_start
-    sim = punch.validate(engine=engine, until=end, step=1e-3)
+def test_a_replay_ends_where_it_is_told_to(hammered: Solution, engine: str) -> None:
+    end = 0.5 * hammered.trajectory.contact_start
+    sim = hammered.validate(engine=engine, until=end, step=1e-3)
     assert end - 0.01 < sim.time[-1] < end + 1e-9 and sim.impulse == 0
     for bad in (0.0, -1.0, np.nan):
         with pytest.raises(InputError, match=r"until \[s\]"):
-            punch.validate(engine=engine, until=bad)
+            hammered.validate(engine=engine, until=bad)
 
 
 @pytest.mark.slow

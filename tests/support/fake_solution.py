@@ -134,14 +134,17 @@ def simulation_of(solution: Solution, *, touches: bool = True, peak: float = 0.9
 
 
 class FakeSolution(Solution):
-    """`validate` gives the made-up replay."""
+    """`validate` gives the made-up replay, `clearance` a made-up distance."""
+
+    def clearance(self) -> dict[str, Any]:
+        return {"clearance_mm": 50.0, "nearest": "fist and thigh", "contacts_besides": []}
 
     def validate(self, *, engine: str = "pinocchio", **options: Any) -> Simulation:
         made = simulation_of(self)
         return replace(made, engine=engine, fall=None if engine == "pinocchio" else "")
 
 
-class MissingSolution(Solution):
+class MissingSolution(FakeSolution):
     """A plan that misses the target when it is replayed."""
 
     def validate(self, **options: Any) -> Simulation:

@@ -71,7 +71,7 @@ def strike(
     force = own * speed / push
     robot = slider(own - rotor, armature=rotor)
     ref = reference(
-        [0.0, push, push, 0.5], np.zeros(1), torque=[[force], [force], [0.0], [0.0]], nv=1, n=1, end=0.5
+        [0.0, push, push, 0.2], np.zeros(1), torque=[[force], [force], [0.0], [0.0]], nv=1, n=1, end=0.2
     )
     # half a step after a recorded instant: the worst place for an event
     point = np.array([0.5 * speed * push + speed * 0.04 + 0.5 * step * speed, 0.0, 0.0])

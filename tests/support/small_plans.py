@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,13 @@ from impactopt import (
     Plan,
     Robot,
     SelfCollision,
+    Solution,
     SpringDamper,
     Term,
     Trajectory,
 )
 from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
-from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.ipm.interior_point import IPMOptions, solve_ipm
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.strike import StrikeTranscription
@@ -31,7 +33,8 @@ from support.small_robots import arm, biped, striking_point
 
 Array = NDArray[np.float64]
 LAW = SpringDamper(stiffness=1e4, damping=300.0)
-OPTIONS: dict[str, Any] = {"tol": 1e-4}  # of IPOPT, on the biped
+EXACT = IPMOptions(complementarity_tolerance=1e-7)  # bounds that are active are so to a millionth
+STEP = 5e-4  # [s] of simulations
 # for tests of something else, where a robot's boxes are in the way or cost time
 BODILESS: tuple[Term, ...] = (SelfCollision(enabled=False), KeepOut(enabled=False))
 
@@ -92,18 +95,35 @@ class Planned:
     result: SolverResult
     plan: Plan
     trajectory: Trajectory
-    simulation: Simulation
+    scene: Scene
+
+    @cached_property
+    def simulation(self) -> Simulation:
+        """Computed for those who look at it: it takes longer than the solve."""
+        return simulate_pinocchio(self.problem.robot, self.trajectory, self.scene, step=STEP, settle=0.0)
 
 
-def planned(transcription: Transcription, options: dict[str, Any], scene: Scene | None = None) -> Planned:
-    """Solved and simulated; ``scene``: if not the problem's."""
+def planned(transcription: Transcription, scene: Scene | None = None) -> Planned:
+    """Solved, to be simulated; ``scene``: if not the problem's."""
     problem = transcription.problem
     start = first_iterate(transcription)
-    result = solve_ipopt(transcription.program, start, options=options)
+    result = solve_ipm(transcription.program, start, options=EXACT)
     plan = transcription.decode(result.x)
-    trajectory = plan.trajectory()
-    simulation = simulate_pinocchio(problem.robot, trajectory, scene or scene_of(problem), settle=0.0)
-    return Planned(problem, transcription, start, result, plan, trajectory, simulation)
+    scene = scene or scene_of(problem)
+    return Planned(problem, transcription, start, result, plan, plan.trajectory(), scene)
+
+
+def solution_of(planned: Planned) -> Solution:
+    """The plan as users get it."""
+    return Solution(
+        problem=planned.problem,
+        plan=planned.plan,
+        result=planned.result,
+        solver="ipm",
+        build_seconds=0.0,
+        solve_seconds=0.0,
+        violations=(),
+    )
 
 
 def rod_hammer(problem: ImpactProblem) -> ImpactProblem:

@@ -84,7 +84,7 @@ def test_ctrl_c_and_a_worker_that_is_killed_cost_nothing_and_the_table_tells_all
             assert victim.pid is not None
             os.kill(victim.pid, signal.SIGKILL)
 
-    result = sweep(SWEEP, tmp_path / "out", workers=2, progress=kill_one)
+    result = sweep(SWEEP, tmp_path / "out", workers=1, progress=kill_one)
     assert rows(result.table) == undisturbed
     assert (result.cases, result.done, result.failed, result.resumed) == (4, 4, failures(undisturbed), 1)
     assert [now.done for now in told] == [2, 3, 4] and told[-1].remaining == 0
@@ -222,7 +222,8 @@ def test_a_case_that_does_not_stop_is_ended(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.slow
-def test_workers_have_one_blas_thread() -> None:
+def test_workers_have_one_blas_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)  # conftest's
     assert dict(each_on_workers(pools, None, [(0, 0)], workers=1)) == {0: 1}
 
 

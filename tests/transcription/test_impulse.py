@@ -12,14 +12,13 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
-from support.small_plans import LAW, OPTIONS, Planned, changed, planned
+from support.small_plans import LAW, Planned, changed, planned, solution_of
 
 from impactopt import (
     FreeMass,
     ImpactProblem,
     KelvinVoigt,
     Plan,
-    Solution,
     Status,
     TorqueLimit,
     load_problem,
@@ -220,7 +219,7 @@ def in_soles_axes(problem: ImpactProblem, q: Array, wrench: Array) -> Array:
 def solved(request: pytest.FixtureRequest) -> Planned:
     who, kind = request.param
     transcription = changed(request.getfixturevalue(f"{who}_transcription"), **KINDS[kind])
-    return planned(transcription, OPTIONS)
+    return planned(transcription)
 
 
 def contact_state(plan: Plan) -> tuple[Array, Array, Array]:
@@ -273,15 +272,7 @@ def test_it_says_nothing_of_the_collision_that_it_does_not_know(solved: Planned)
 
 @pytest.mark.slow
 def test_it_is_kept_shown_and_drawn(solved: Planned, tmp_path: Path) -> None:
-    solution = Solution(
-        problem=solved.problem,
-        plan=solved.plan,
-        result=solved.result,
-        solver="ipopt",
-        build_seconds=0.0,
-        solve_seconds=0.0,
-        violations=(),
-    )
+    solution = solution_of(solved)
     for simulation in (None, solved.simulation):
         folder = tmp_path / ("planned" if simulation is None else "simulated")
         save_record(record_of(solution, simulation=simulation), folder)

@@ -54,7 +54,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.fixture(params=[(robot, kind) for kind in VARIANTS for robot in ("biped", "arm")], ids=", ".join)
+@pytest.fixture(
+    scope="module", params=[(robot, kind) for kind in VARIANTS for robot in ("biped", "arm")], ids=", ".join
+)
 def transcription(request: pytest.FixtureRequest) -> Transcription:
     robot, kind = request.param
     return changed(request.getfixturevalue(f"{robot}_transcription"), **VARIANTS[kind])

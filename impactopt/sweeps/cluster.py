@@ -8,7 +8,7 @@ import logging
 import time
 import uuid
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import Any
 
 from impactopt.errors import InputError, missing_package
@@ -130,23 +130,23 @@ class _Pool:
 
 
 def _found(unit: Unit, future: Any) -> Found:
-    """Result of a finished task; InputError if the sweep cannot go on."""
-    if future.status == "finished":
+    """Result of a task, made again if it has died with its worker; InputError if the sweep cannot go on."""
+    try:
         found: Found = future.result()
         return found
-    if future.status == "error":
-        error = future.exception()
-        if isinstance(error, _distributed().scheduler.KilledWorker):
-            reason = "every worker that had it died: crashed, killed, out of memory, or far beyond its time"
-            return Found(columns=failed_columns(unit.count, "crashed", reason), peak_mb=0.0)
-        if isinstance(error, InputError):
-            raise error
+    except _distributed().scheduler.KilledWorker:
+        reason = "every worker that had it died: crashed, killed, out of memory, or far beyond its time"
+        return Found(columns=failed_columns(unit.count, "crashed", reason), peak_mb=0.0)
+    except CancelledError as error:
+        raise InputError(
+            "the Dask scheduler is lost, or has forgotten these tasks; finished cases are kept, and the same "
+            "command resumes the sweep"
+        ) from error
+    except InputError:
+        raise
+    except Exception as error:
         what = f"{type(error).__name__}: {error}"
-        raise InputError(f"the workers cannot do it ({what}); do they have the same impactopt?")
-    raise InputError(
-        "the Dask scheduler is lost, or has forgotten these tasks; finished cases are kept, and the same "
-        "command resumes the sweep"
-    )
+        raise InputError(f"the workers cannot do it ({what}); do they have the same impactopt?") from error
 
 
 def _distributed() -> Any:

@@ -96,6 +96,38 @@ def lethal(folder: Path, unit: Unit) -> Any:
 
 
 @pytest.mark.slow
+def test_results_that_die_with_their_workers_are_computed_again(
+    client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All workers are killed after they have finished, and before their results are taken."""
+    following = distributed.as_completed.__next__
+    lost: list[Any] = []
+
+    def then_killed(finished: Any) -> Any:
+        future = following(finished)
+        if not lost:
+            lost.append(future)
+            for process in client.run(os.getpid).values():
+                os.kill(process, signal.SIGKILL)
+            until = time.monotonic() + 10
+            while future.status == "finished" and time.monotonic() < until:
+                time.sleep(0.001)
+        return future
+
+    monkeypatch.setattr(distributed.as_completed, "__next__", then_killed)
+    monkeypatch.setattr("impactopt.sweeps.cluster.evaluate", harmless)
+    units = [Unit(index=k, first=k, count=1, columns={}) for k in range(3)]
+    found = {unit.index: result.peak_mb for unit, result in on_cluster("", units, client, print)}  # type: ignore[arg-type]
+    assert lost and found == {0: 0.0, 1: 1.0, 2: 2.0}
+
+
+def harmless(_: str, unit: Unit) -> Any:
+    from impactopt.sweeps.design import Found
+
+    return Found(columns={"reason": [""]}, peak_mb=float(unit.index))
+
+
+@pytest.mark.slow
 def test_workers_of_another_version_are_refused(client: Any) -> None:
     work = Work(data={}, path=Path("p"), settings=SweepSection(problem="p"), version="0.0.0")
     with pytest.raises(InputError, match=r"a worker has impactopt .*, the sweep 0\.0\.0"):

@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.world import WorldBody
-from impactopt.kinematics.operational_space import ConstrainedDynamics
+from impactopt.kinematics.operational_space import ConstrainedDynamics, striking_point
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
@@ -64,7 +64,7 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
         links=np.array(links),
         strikes=np.array([True] * len(names) + [*of_limb, *[False] * (2 * len(robot.soles))]),
         contact=POSES_BEFORE - 1,
-        path=np.array([_place(robot, problem.striker, q) for q in reference.q]),
+        path=striking_point(robot, problem.striker, reference.q),
         target=_corners([b for b in visible if b.of_target]),
         obstacles=_corners([b for b in visible if not b.of_target]),
         ground=np.array([z for z in [problem.ground_height] if z is not None]),
@@ -109,13 +109,6 @@ def _links(robot: Robot, strikers: Sequence[str], q: Array) -> list[Array]:
 
 def _point(data: pin.Data, model: pin.Model, frame: pin.Frame) -> Array:
     return np.array(data.oMf[model.getFrameId(frame.name)].translation)
-
-
-def _place(robot: Robot, striker: str, q: Array) -> Array:
-    """Position of the striking point (3,) [m]."""
-    model, data = robot.model, robot.model.createData()
-    pin.framesForwardKinematics(model, data, q)
-    return _point(data, model, _striker(robot, striker))
 
 
 def _corners(bodies: Sequence[WorldBody]) -> Array:

@@ -51,9 +51,8 @@ def export(
         str | None,
         typer.Option(
             metavar="A,J|terms",
-            help="Smooth: the nearest motion with at most A rad/s^2 and J rad/s^3, or the limits in "
-            "[terms.joint_acceleration] and [terms.joint_jerk], for bolted arms whose controllers refuse "
-            "more.",
+            help="Smooth: the nearest motion with at most A rad/s^2 and J rad/s^3, or with the limits in the "
+            "problem's joint_acceleration and joint_jerk, for bolted arms whose controllers refuse more.",
         ),
     ] = None,
     problem: OtherProblem = None,

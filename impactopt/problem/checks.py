@@ -36,7 +36,7 @@ from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import margin, shrink, support_polygon
 from impactopt.problem.motion_style import STYLES
 from impactopt.problem.objectives import Penetration, TargetEnergy
-from impactopt.problem.terms import ContactWrenchCone, Grip, MotorCurve, PowerLimit, Term
+from impactopt.problem.terms import ContactWrenchCone, Grip, JointJerk, MotorCurve, PowerLimit, Term
 from impactopt.robots.actuators import numbers_of
 from impactopt.robots.checks import LEG, check_arms
 from impactopt.robots.gains import GainFactor, scaled_gains
@@ -176,6 +176,19 @@ def check_motors(problem: Any) -> None:
             raise InputError(
                 f"{kind.__name__} is about motors whose {name} is known, and none of {robot.name!r} is: give "
                 f"{other}their data as [[robot.actuators]], or leave it out"
+            )
+
+
+def check_jerk(problem: Any) -> None:
+    """InputError for a limit of the jerk of a joint that others determine, which a plan would ignore."""
+    term, robot = problem.extra(JointJerk), problem.robot
+    if term is None or not term.joints:
+        return
+    for k in problem.coordinates.dependent:
+        if (joint := robot.joint_names[k]) in term.joints:
+            raise InputError(
+                f"JointJerk.limit: {joint!r} is determined by the other joints and a fixed sole or hand; "
+                "leave it out"
             )
 
 

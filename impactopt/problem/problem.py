@@ -205,6 +205,8 @@ class ImpactProblem:
             mistakes.attempt(partial(checks.check_hands, self))
             mistakes.attempt(partial(checks.check_hinges, self))
         sound = sound and mistakes.attempt(partial(checks.check_strikers, self))
+        if sound:
+            mistakes.attempt(partial(checks.check_jerk, self))
         if sound and aim and mistakes.attempt(lambda: self.contact_posture):
             mistakes.attempt(partial(checks.check_moves, self))
         mistakes.raise_if_any("the problem")

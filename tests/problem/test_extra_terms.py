@@ -23,6 +23,7 @@ from impactopt import (
     Impulse,
     Incidence,
     InputError,
+    JointJerk,
     Phase,
     Status,
     Term,
@@ -210,6 +211,17 @@ def test_names_that_the_robot_does_not_have_are_refused(arm_transcription: Trans
             changed(arm_transcription, terms=(term,))
     with pytest.raises(InputError, match="takes the place of Incidence"):
         changed(arm_transcription, terms=(HitCone(), Incidence()))
+
+
+def test_a_jerk_that_others_determine_is_refused_with_the_problem(biped_transcription: Transcription) -> None:
+    """A leg's, whose sole stands; before anything is compiled."""
+    problem = biped_transcription.problem
+    names, c = problem.robot.joint_names, problem.coordinates
+    leg, free = names[c.dependent[0]], names[c.independent[0]]
+    with pytest.raises(InputError, match=f"JointJerk.limit: {leg!r} is determined by .*leave it out"):
+        replace(problem, terms=(JointJerk(limit={leg: 1e3, free: 1e3}),))
+    for fine in ({free: 1e3}, 1e3):
+        assert replace(problem, terms=(JointJerk(limit=fine),)).extra(JointJerk) is not None
 
 
 @pytest.mark.parametrize("normal", [[1.0, 0, 0], [0, 0, -1.0], [0.6, 0.0, 0.8]])

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impactopt.contact.fields import about
-from impactopt.errors import InputError
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term, of_joints
 from impactopt.problem.violation import Measure
-
-if TYPE_CHECKING:
-    from impactopt.kinematics.coordinates import StanceCoordinates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +33,6 @@ class JointJerk(Term):
     )
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
-        for k in coordinates.dependent:
-            if (joint := coordinates.robot.joint_names[k]) in self.joints:
-                raise InputError(
-                    f"JointJerk.limit: {joint!r} is determined by the other joints and a fixed sole; "
-                    "leave it out"
-                )
         return {"joint_jerk": BlockRecipe(lambda: joint_jerk(coordinates))}
 
     def add_constraints(self, program: Any) -> None:

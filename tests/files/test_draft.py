@@ -508,6 +508,15 @@ def test_fingers_and_wheels_are_locked_and_a_cart_is_bolted(tmp_path: Path) -> N
     assert data["robot"]["floating"] is False
 
 
+def test_fingers_are_light_beside_the_whole_robot_with_its_base(tmp_path: Path) -> None:
+    """Two fingers of 0.4 kg, of 19 kg, more than half of which is bolted to the ground."""
+    text, found = re.subn(
+        r'(claw_\d">\s*<inertial>.*?<mass value=)"0.03"', r'\1"0.4"', urdfs.arm(), flags=re.DOTALL
+    )
+    assert found == 2
+    assert set(_robot(tmp_path, text).locked) == {"slide_0", "slide_1"}
+
+
 def test_a_robot_that_is_a_finger_moves(tmp_path: Path) -> None:
     named = urdfs.arm()
     for joint in re.findall(r'<joint name="(\w+)" type="revolute"', named):

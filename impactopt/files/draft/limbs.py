@@ -78,7 +78,8 @@ def to_lock(model: pin.Model) -> dict[str, str]:
     first = 2 if is_floating(model) else 1
     data = model.createData()
     pin.computeSubtreeMasses(model, data)
-    mass, total = list(data.mass), float(data.mass[0])
+    # Pinocchio's own total lacks what is fixed to the ground, as the base of a bolted arm
+    mass, total = list(data.mass), sum(float(body.mass) for body in model.inertias)
     reach = _reach(model, children)
     effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
     weight = np.abs(pin.computeGeneralizedGravity(model, data, neutral(model)))

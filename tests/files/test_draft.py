@@ -514,7 +514,9 @@ def test_fingers_are_light_beside_the_whole_robot_with_its_base(tmp_path: Path) 
         r'(claw_\d">\s*<inertial>.*?<mass value=)"0.03"', r'\1"0.4"', urdfs.arm(), flags=re.DOTALL
     )
     assert found == 2
-    assert set(_robot(tmp_path, text).locked) == {"slide_0", "slide_1"}
+    (tmp_path / "robot.urdf").write_text(text)
+    for bolted in (True, False):
+        assert set(draft_robot(tmp_path / "robot.urdf", bolted=bolted).locked) == {"slide_0", "slide_1"}
 
 
 def test_a_robot_that_is_a_finger_moves(tmp_path: Path) -> None:

@@ -1267,6 +1267,23 @@ def test_a_ram_strikes_along_its_joint(tmp_path: Path) -> None:
     assert solve(problem).status.usable
 
 
+@pytest.mark.parametrize(
+    ("axis", "face"),
+    [("1 0 0", (0.05, 0, 0)), ("-1 0 0", (0.05, 0, 0)), ("0 0 1", (0, 0, -0.05)), ("0 0 -1", (0, 0, -0.05))],
+)
+def test_a_ram_strikes_with_its_face_ahead_or_below(
+    tmp_path: Path, axis: str, face: tuple[float, float, float]
+) -> None:
+    """Whichever way its joint's axis points: with the face behind, no strike was solved."""
+    links = [
+        urdfs.link("base", 1.0, (0.1, 0.1, 0.1), (0, 0, 0)),
+        urdfs.link("ram", 2.0, (0.1,) * 3, (0, 0, 0)),
+    ]
+    slide = urdfs.joint("slide", "base", "ram", axis, (0.5, 0, 1), (-1, 1), kind="prismatic", effort=500.0)
+    striker, _ = _striker(tmp_path, urdfs.robot("one", *links, slide))
+    np.testing.assert_allclose(striker.point, face, atol=1e-9)
+
+
 def _walker(folder: Path) -> Path:
     """An MJCF of the biped, without a free joint."""
     mujoco = pytest.importorskip("mujoco")

@@ -101,6 +101,11 @@ def on_cluster(
             submit()
             yield unit, _found(unit, future)
             future.release()
+    except (CancelledError, distributed.comm.CommClosedError) as error:
+        raise InputError(
+            "the Dask scheduler is lost, or has forgotten these tasks; finished cases are kept, and the same "
+            "command resumes the sweep"
+        ) from error
     finally:
         if pending:
             with contextlib.suppress(Exception):  # the scheduler may be lost
@@ -130,19 +135,14 @@ class _Pool:
 
 
 def _found(unit: Unit, future: Any) -> Found:
-    """Result of a task, made again if it has died with its worker; InputError if the sweep cannot go on."""
+    """Result of a task, made again if it has died with its worker; InputError if the workers cannot do it."""
     try:
         found: Found = future.result()
         return found
     except _distributed().scheduler.KilledWorker:
         reason = "every worker that had it died: crashed, killed, out of memory, or far beyond its time"
         return Found(columns=failed_columns(unit.count, "crashed", reason), peak_mb=0.0)
-    except CancelledError as error:
-        raise InputError(
-            "the Dask scheduler is lost, or has forgotten these tasks; finished cases are kept, and the same "
-            "command resumes the sweep"
-        ) from error
-    except InputError:
+    except (InputError, CancelledError, _distributed().comm.CommClosedError):
         raise
     except Exception as error:
         what = f"{type(error).__name__}: {error}"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import runpy
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -36,3 +39,17 @@ def test_a_random_target_has_a_start_of_its_own(monkeypatch: pytest.MonkeyPatch)
         at = striking_point(one.robot, one.striker, one.start_posture)
         assert one.normal @ (one.point - at) >= robots.BEHIND
         assert one.point[0] > robots.FRONT
+
+
+def test_ci_s_robots_leave_the_rows_of_the_bench_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A row whose file has moved is refused in no time, which is a failure."""
+    monkeypatch.chdir(tmp_path)
+    robots.ROWS.parent.mkdir(parents=True)
+    robots.ROWS.write_text("half an hour\n")
+    monkeypatch.setitem(robots.ROBOTS, "gone", "gone.urdf")
+    monkeypatch.setattr(sys, "argv", ["check_robots.py", "gone"])
+    with pytest.raises(SystemExit, match="1"):
+        runpy.run_path(str(Path(__file__).parents[2] / ".ci" / "check_robots.py"))
+    assert robots.ROWS.read_text() == "half an hour\n"

@@ -298,7 +298,7 @@ def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
 ) -> None:
     """By differences of the rows alone; and the blow is nearly the planned one."""
     robot, limits = arm.problem.robot, (60.0, 5000.0)
-    meta, path = arm.export("csv", tmp_path / "csv", smooth=limits)
+    meta, path = arm.export("csv", tmp_path / "csv", smooth=np.array(limits))  # type: ignore[arg-type]
     read = from_csv(path, robot)
     gap = np.diff(read.time)[:, None]
     acceleration = np.diff(read.v, axis=0) / gap
@@ -425,7 +425,10 @@ def test_a_smoothed_motion_keeps_the_limits_of_the_problem_s_terms_by_joint(
     most = {joint: 40.0 + 20.0 * k for k, joint in enumerate(robot.joint_names)}
     terms = (*planned.problem.terms, JointAcceleration(limit=most), JointJerk(limit=5000.0))
     limited = dataclasses.replace(planned, problem=dataclasses.replace(planned.problem, terms=terms))
-    _, path = export_planned(limited, "csv", tmp_path / "csv", smooth="terms")[:2]
+    order = robot.joint_names[::-1]
+    meta, path = export_planned(limited, "csv", tmp_path / "csv", smooth="terms", joints=order)[:2]
+    told = json.loads(meta.read_text())["smooth"]
+    assert told["acceleration_rad_s2"] == most and told["jerk_rad_s3"] == dict.fromkeys(order, 5000.0)
     read = from_csv(path, robot)
     used = np.abs(np.diff(read.v, axis=0) / np.diff(read.time)[:, None]).max(axis=0) / [*most.values()]
     assert used.max() < 1 + 1e-6 and used.min() > 0.5  # each joint has its own limit

@@ -121,6 +121,19 @@ def test_results_that_die_with_their_workers_are_computed_again(
     assert lost and found == {0: 0.0, 1: 1.0, 2: 2.0}
 
 
+@pytest.mark.slow
+def test_a_scheduler_that_is_lost_while_it_gives_a_result_is_named(
+    client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(future: Any) -> None:
+        raise distributed.comm.CommClosedError("Connection reset by peer")
+
+    monkeypatch.setattr(distributed.Future, "result", broken)
+    monkeypatch.setattr("impactopt.sweeps.cluster.evaluate", harmless)
+    with pytest.raises(InputError, match="scheduler is lost"):
+        list(on_cluster("", [Unit(index=0, first=0, count=1, columns={})], client, print))  # type: ignore[arg-type]
+
+
 def harmless(_: str, unit: Unit) -> Any:
     from impactopt.sweeps.design import Found
 

@@ -140,7 +140,10 @@ def _away(model: pin.Model, limb: Limb) -> Array:
         if np.linalg.norm(step) > APART:
             return np.asarray(tip.rotation.T @ step / np.linalg.norm(step))
     slides = axis_of(model, limb.tip).subspace[:3]  # zero for a revolute joint
-    return np.array(slides) if slides.any() else np.array([0.0, 0.0, 1.0])  # a ram pushes along its joint
+    if not slides.any():
+        return np.array([0.0, 0.0, 1.0])
+    # a ram pushes along its joint, ahead or down, whichever way the joint's axis points
+    return np.array(slides if (tip.rotation @ slides) @ (1.0, 0.0, -1.0) >= 0 else -slides)
 
 
 def _axis(

@@ -330,9 +330,13 @@ def _smoothed(
         )
     driven = ~planned.problem.robot.passive
     ratio = np.abs(reference.torque[:, driven]) / planned.problem.robot.torque_limit[driven]
+    names = planned.problem.robot.joint_names
+    acceleration, jerk = (
+        dict(zip(names, most, strict=True)) if isinstance(limits, str) else most[0] for most in within.limits
+    )
     smoothing: dict[str, Any] = {
-        "acceleration_rad_s2": within.limits[0] if limits == "terms" else within.limits[0][0],
-        "jerk_rad_s3": within.limits[1] if limits == "terms" else within.limits[1][0],
+        "acceleration_rad_s2": acceleration,
+        "jerk_rad_s3": jerk,
         "impulse_Ns": impulse,
         "planned_impulse_Ns": float(planned.record.summary["impulse_Ns"]),
         "pressing_Ns": pressing,

@@ -43,7 +43,7 @@ class Smoothness:
         InputError : neither two positive numbers nor "terms"; a problem without limits of all joints.
         """
         names = problem.robot.joint_names
-        if given == "terms":
+        if isinstance(given, str) and given == "terms":  # an array's == is an array
             found = problem.extra(JointAcceleration), problem.extra(JointJerk)
             limits = [of_joints(term.limit, names) for term in found if term is not None]
             if len(limits) < 2 or not np.isfinite(limits).all():

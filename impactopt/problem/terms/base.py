@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import Field, dataclass, fields
 from typing import Any, ClassVar
 
@@ -128,6 +128,26 @@ class Term(Described):
         """Joints that the robot must have: the keys of fields with values by joint."""
         given = [getattr(self, field.name) for field, about in abouts(type(self)) if about.by_joint]
         return tuple(name for value in given if isinstance(value, Mapping) for name in value)
+
+
+def bound_at_each(
+    program: Any,
+    term: Term,
+    block: str,
+    spots: Sequence[tuple[Any, Any]],
+    components: Sequence[str],
+    parameters: Any = (),
+    **bounds: Any,
+) -> None:
+    """Add a block with an instance at each spot, and a term's bounds on the outputs of each instance.
+
+    spots : places and slots.  components : names of an instance's outputs.  bounds : arguments of
+    `impactopt.transcription.layout.Constraints.add`, such as ``lower``, ``upper`` and ``measure``.
+    """
+    at = program.add_block(block, [slots for _, slots in spots], np.asarray(parameters, dtype=float))
+    outputs = at + np.arange(len(spots) * len(components)).reshape(len(spots), len(components))
+    for (place, _), own in zip(spots, outputs, strict=True):
+        program.constraints.add(term=term.name, place=place, components=components, outputs=own, **bounds)
 
 
 def of_joints(limit: float | Mapping[str, float], names: Iterable[str]) -> Any:

@@ -13,7 +13,7 @@ from impactopt.contact.fields import about
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
-from impactopt.problem.terms.base import Term
+from impactopt.problem.terms.base import Term, bound_at_each
 from impactopt.problem.violation import degrees
 
 
@@ -54,17 +54,9 @@ class Gaze(Term):
         def numbers(point: Any) -> Any:
             return np.array([*self.axis, *point, np.sin(self.angle)])
 
-        at = program.add_block("gaze", [slots for _, slots in nodes], numbers(program.problem.point))
+        bounds: dict[str, Any] = {"lower": 1 / np.tan(self.angle), "measure": degrees("too far off")}
+        bound_at_each(program, self, "gaze", nodes, [self.frame], numbers(program.problem.point), **bounds)
         program.builder.follow(lambda b: b.block("gaze").take_parameters(numbers(b.problem.point)))
-        for i, (place, _) in enumerate(nodes):
-            program.constraints.add(
-                term=self.name,
-                place=place,
-                components=[self.frame],
-                outputs=np.array([at + i]),
-                lower=1 / np.tan(self.angle),
-                measure=degrees("too far off"),
-            )
 
 
 def gaze(c: StanceCoordinates, frame: str) -> BlockExpression:

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import casadi as ca
-import numpy as np
 
 from impactopt.contact.fields import about
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
-from impactopt.problem.terms.base import Term, of_joints
-from impactopt.problem.violation import Measure
+from impactopt.problem.terms.base import Term, bound_at_each, of_joints
+from impactopt.problem.violation import percent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,19 +35,12 @@ class JointAcceleration(Term):
 
     def add_constraints(self, program: Any) -> None:
         names = program.robot.joint_names
-        limit = of_joints(self.limit, names)
+        most = of_joints(self.limit, names) / TYPICAL
+        measure = [percent("over its limit", of=limit) for limit in most]
         spots = program.motion()
-        at = program.add_block("joint_acceleration", [slots for _, slots in spots], np.zeros(0))
-        for k, (place, _) in enumerate(spots):
-            program.constraints.add(
-                term=self.name,
-                place=place,
-                components=names,
-                outputs=at + len(names) * k + np.arange(len(names)),
-                lower=-limit / TYPICAL,
-                upper=limit / TYPICAL,
-                measure=[Measure("%", 100 * TYPICAL / most, "over its limit") for most in limit],
-            )
+        bound_at_each(
+            program, self, "joint_acceleration", spots, names, lower=-most, upper=most, measure=measure
+        )
 
 
 TYPICAL = 100.0  # [rad/s^2] of a strike, by which the constraints are scaled

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import casadi as ca
-import numpy as np
 
 from impactopt.contact.fields import about
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
-from impactopt.problem.terms.base import Term, of_joints
-from impactopt.problem.violation import Measure
+from impactopt.problem.terms.base import Term, bound_at_each, of_joints
+from impactopt.problem.violation import percent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,18 +36,10 @@ class JointJerk(Term):
 
     def add_constraints(self, program: Any) -> None:
         names = [program.robot.joint_names[k] for k in program.coordinates.independent]
-        limit, spots = of_joints(self.limit, names), program.third_derivatives()
-        at = program.add_block("joint_jerk", [slots for _, slots in spots], np.zeros(0))
-        for k, (place, _) in enumerate(spots):
-            program.constraints.add(
-                term=self.name,
-                place=place,
-                components=names,
-                outputs=at + len(names) * k + np.arange(len(names)),
-                lower=-limit / TYPICAL,
-                upper=limit / TYPICAL,
-                measure=[Measure("%", 100 * TYPICAL / most, "over its limit") for most in limit],
-            )
+        most = of_joints(self.limit, names) / TYPICAL
+        measure = [percent("over its limit", of=limit) for limit in most]
+        spots = program.third_derivatives()
+        bound_at_each(program, self, "joint_jerk", spots, names, lower=-most, upper=most, measure=measure)
 
 
 TYPICAL = 1e3  # [rad/s^3] of a strike, by which the constraints are scaled

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import casadi as ca
-import numpy as np
 
 from impactopt.contact.fields import about
 from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
 from impactopt.kinematics.operational_space import across
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
-from impactopt.problem.terms.base import Term
+from impactopt.problem.terms.base import Term, bound_at_each
 from impactopt.problem.violation import millimetres
 
 
@@ -41,17 +40,9 @@ class Slide(Term):
     def add_constraints(self, program: Any) -> None:
         # none in an impact without duration: nothing slides
         points, tangents = program.positions_in_contact(), across(program.problem.normal)
-        at = program.add_block("slide", [slots for _, slots in points], tangents.ravel())
-        for k, (place, _) in enumerate(points):
-            program.constraints.add(
-                term=self.name,
-                place=place,
-                components=["tangent 1", "tangent 2"],
-                outputs=at + 2 * k + np.arange(2),
-                lower=-self.most,
-                upper=self.most,
-                measure=millimetres("too far"),
-            )
+        bounds: dict[str, Any] = {"lower": -self.most, "upper": self.most, "measure": millimetres("too far")}
+        names = ["tangent 1", "tangent 2"]
+        bound_at_each(program, self, "slide", points, names, tangents.ravel(), **bounds)
 
 
 def slide(c: StanceCoordinates, striker: str) -> BlockExpression:

@@ -60,7 +60,15 @@ def test_a_bound_keeps_it_short(plan: Plan) -> None:
     most = 0.3 * slide(plan.problem, plan)
     t = transcribed(replace(plan.problem, terms=(*plan.problem.terms, Slide(most=most))))
     kept = t.decode(solve_ipopt(t.program, first_iterate(t)).x)
-    assert slide(kept.problem, kept) < 1.01 * np.sqrt(2) * most
+    model = kept.problem.robot.model
+    data = model.createData()
+    striker = kept.problem.robot.striker(kept.problem.striker).model_frame
+    for y in kept.collision.motion[:, 0]:
+        pin.framesForwardKinematics(model, data, kept.coordinates.join(y, np.zeros(0)))
+        away = data.oMf[model.getFrameId(striker)].translation - kept.problem.point
+        across_normal = away - (away @ kept.problem.normal) * kept.problem.normal
+        assert np.linalg.norm(across_normal) < 1.001 * np.sqrt(2) * most
+    assert slide(kept.problem, kept) < min(1.01 * np.sqrt(2) * most, slide(plan.problem, plan))
     assert 0.5 * plan.impulse < kept.impulse < plan.impulse
 
 

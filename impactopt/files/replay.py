@@ -69,7 +69,7 @@ def program_of_record(record: Record, problem: ImpactProblem) -> Transcription |
     statement: dict[str, Any] = json.loads(str(record.arrays["program_statement"]))
     elements: Elements = tuple(tuple(e) for e in statement["elements"]) if statement["guarded"] else ()
     swing, follow, *stances = (tuple(added) for added in statement["added_nodes"])
-    nodes = MoreNodes(swing, follow, tuple(stances))
+    nodes = MoreNodes(swing, follow, tuple(stances), bool(statement.get("nodes_in_contact")))
     t = program_on(problem, nodes, elements, tuple(statement.get("shares", ())))
     clearances = {
         ClearanceKey(*(entry[key] for key in ClearanceKey._fields)): SeparatingDirection(

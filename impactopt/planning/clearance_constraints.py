@@ -144,9 +144,7 @@ def node_placements(t: ContactProgram, x: Array) -> NodePlacements:
     """Placements of all bodies at all nodes of a program, for solver variables x (n,)."""
     states = t.body_states(x)
     phase, time = np.array([s.phase for s in states], dtype=np.intp), np.array([s.time for s in states])
-    # during contact the target counts as where it is at the first touch
     travel, aside = t.displacement(x, time)
-    travel[phase == IN_CONTACT], aside[phase == IN_CONTACT] = 0.0, 0.0
     q = np.array([s.q for s in states])
     return NodePlacements(
         names=tuple(s.name for s in states), time=time, at=Places.of(t.robot, q, travel, phase, aside)
@@ -351,6 +349,7 @@ LOST_BETWEEN_NODES, LOST_AT_NODES = 0.5, 0.25
 MAX_RAISE = 0.02  # [m] of the clearance required at a node, in one round
 # [m] only pieces of a pair that are nearer than its nearest two plus this get a raised clearance
 RAISED_WITHIN = 0.01
+MAX_MOVED = 1e-3  # [m] of the target between a constraint and the solution, without another solve
 MIN_NODE_INTERVAL = 2e-3  # [s] between a new node and its neighbours
 END_FRACTION = 0.2  # of the interval of two nodes: a new one stays so far from either
 
@@ -474,8 +473,13 @@ class _RaisedClearances:
             }
             gaps = {key: float(self._gaps[k, index[key[1:]]]) for key in own}
             nearest = min(gaps.values(), default=0.0)
+            travel, aside = float(self._nodes.at.travel[k]), tuple(self._nodes.at.aside[k].tolist())
             for key, held in own.items():
-                if gaps[key] < nearest + RAISED_WITHIN:
+                # A constraint has the other body where the target was in the initial guess.
+                if pair[1] < 0 and abs(held.travel - travel) > MAX_MOVED:
+                    moved = held._replace(travel=travel, aside=aside)
+                    self.constraints[ClearanceKey(*key)] = moved
+                elif gaps[key] < nearest + RAISED_WITHIN:
                     raised = self.constraints.get(key, held).least_distance
                     least = max(held.least_distance, raised, nearest + missing)
                     self.constraints[ClearanceKey(*key)] = held._replace(least_distance=least)
@@ -487,18 +491,21 @@ class _AddedNodes:
     def __init__(self, t: Transcription, plan: Plan) -> None:
         # fractions of the phase's duration (0 to 1), by phase: before contact (0), and after it
         self._plan, self._fractions = plan, {0: set(t.nodes.swing), AFTER_CONTACT: set(t.nodes.follow)}
-        self._stands = t.nodes.stands
+        self._known, self._contact = t.nodes, t.nodes.contact
 
     @property
     def all(self) -> MoreNodes:
         swing, follow = self._fractions[0], self._fractions[AFTER_CONTACT]
-        return MoreNodes(tuple(sorted(swing)), tuple(sorted(follow)), self._stands)
+        return MoreNodes(tuple(sorted(swing)), tuple(sorted(follow)), self._known.stands, self._contact)
 
     def add(self, approach: _Approach, jumps: bool) -> bool:
         """Add a node at an instant, or as near to it as other nodes allow.
 
         jumps : bodies change sides between the nodes; the new one gets one more on either side.
-        Returns False if the neighbours are too close to each other, or the instant is in contact.
+        An instant in contact gets all collocation points as nodes.
+
+        Returns False if there is no room for a node: the neighbours are too close to each other, or the
+        collocation points are nodes already.
         """
         for phase, fractions in self._fractions.items():
             curve, begin, nodes, _ = self._plan.segment(phase, missed=approach.missed)
@@ -517,14 +524,18 @@ class _AddedNodes:
                 sides = both if jumps and span > 4 * MIN_NODE_INTERVAL else []
                 fractions.update(round(s, 4) for s in (fraction, *sides))
             return True
-        return False
+        in_contact = self._plan.contact_start < approach.time < self._plan.contact_end
+        room = in_contact and not approach.missed and not self._known.contact
+        self._contact |= room
+        return room
 
 
 def _adjacent_nodes(nodes: NodePlacements, time: float, missed: bool) -> list[int]:
     """Indices of the nodes before and after a time [s] of the motion, or of the one that misses the
     target.
     """
-    of_motion = nodes.at.phase != (AFTER_CONTACT if missed else MISSED)
+    others = (IN_CONTACT, AFTER_CONTACT) if missed else (MISSED,)
+    of_motion = ~np.isin(nodes.at.phase, others)
     # The two motions after contact overlap in time: the nodes of one of them are searched.
     order = np.flatnonzero(of_motion)[np.argsort(nodes.time[of_motion], kind="stable")]
     k = int(np.searchsorted(nodes.time[order], time))

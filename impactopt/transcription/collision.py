@@ -180,6 +180,7 @@ class Collision(ContactParameters):
     scenario : of the target; None: the expected one.
     after : labels and bounds of the variables of the position after contact. None: there are no such
         variables, as a follow-through starts there.
+    lifted : add the positions at the stages but the last one as variables, for clearance constraints.
 
     Attributes
     ----------
@@ -200,6 +201,7 @@ class Collision(ContactParameters):
     state : of the target.
     p : impulse to the target since contact [N s].
     after : position y after contact.
+    y : positions at the stages but the last one, if ``lifted``; else empty.
     """
 
     def __init__(
@@ -213,6 +215,7 @@ class Collision(ContactParameters):
         guarded: bool,
         scenario: Scenario | None = None,
         after: dict[str, Any] | None,
+        lifted: bool = False,
     ) -> None:
         self._b, self.contact, self.stages = b, contact, stages
         self.number, self.scenario = number, scenario
@@ -276,6 +279,8 @@ class Collision(ContactParameters):
         self.joined_x = b.layout.add(f"{prefix}target travel in compression", joined, 1)
         count = int(after is not None)
         self.after = b.layout.add(f"{prefix}position after contact", count, b.ny, **(after or {}))
+        # The last stage is where the follow-through starts, which has a node there.
+        self.y = b.layout.add(f"{prefix}position in contact", lifted * (n - 1), b.ny, labels=c.labels)
 
     def _least_force(self, guarded: bool) -> Any:
         """Lower bound of the forces at the stages [N]: zero if law or target might make bodies pull.
@@ -423,7 +428,7 @@ class Collision(ContactParameters):
             out.append(determined(Turn.ELEMENT, whole, step))
         if self.scenario is not None:
             out.append(determined(Turn.AFTER, self.after.index(0)))
-        return out
+        return [*out, *(determined(Turn.AFTER, self.y.index(i)) for i in range(self.y.count))]
 
     # ------------------------------------------------------------------ collocation
     def _before(self, phase: int) -> tuple[Affine, Affine, Affine]:
@@ -520,6 +525,10 @@ class Collision(ContactParameters):
     def positions(self) -> list[tuple[Place, list[Affine]]]:
         """Place, and the first slots of `_motion`, which are y, at each stage."""
         return [(self._place(s), self._motion(i)[:5]) for i, s in enumerate(self.stages)]
+
+    def spots(self) -> list[tuple[Place, list[Affine]]]:
+        """Place, coordinates and legs at each stage whose position is a variable."""
+        return [(self._place(self.stages[i]), [self.y[i], self.legs[i]]) for i in range(self.y.count)]
 
     def _motion(self, i: int) -> list[Affine]:
         """Slots of `impactopt.problem.block.joint_motion` at a stage."""
@@ -695,10 +704,23 @@ class Collision(ContactParameters):
 
         start : y, y' and duration [s] of that phase.
         """
-        last = len(self.end) - 1
-        T1, d1, _ = self._before(last)
-        end = self.end[last]
-        return self.contact.link(start, (T1, self.T[last][0]), (d1, self.d[end]), self.u[end])
+        return self._link(self.end[-1], start)
+
+    def _link(self, i: int, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
+        """Slots of the block ``link`` from a stage."""
+        d1, T1, d, T = self._travel(i)
+        return self.contact.link(start, (T1, T), (d1, d), self.u[i])
+
+    def link_positions(self) -> list[list[Affine]]:
+        """Slots of the block ``link`` that determine the positions `y`, stage by stage."""
+        one, each = Affine.constant(1.0), range(self.y.count)
+        return [slots for i in each for slots in self._link(i, (self.y[i], self.u[i], one))]
+
+    def write_positions(self, x: Array) -> None:
+        """Write the positions `y` that the other variables determine to x (n,)."""
+        for i in range(self.y.count):
+            y0, d1, T1, d, T = (e.evaluate(x) for e in self._motion(i)[:5])
+            x[self.y.index(i)] = y0 + T1 * d1 + T * d
 
     @property
     def state_after(self) -> list[Affine]:
@@ -742,6 +764,7 @@ class Collision(ContactParameters):
             means = [(times[:k, None] / before[k] * each[:k]).sum(axis=0) for k in range(2, len(times))]
             joined.write(x, np.reshape(means, (joined.count, joined.size)))
         self.after.write(x, y + float(found.moved[self.end].sum()) * rates)
+        self.write_positions(x)
         self.guess_model(x, y, rates, legs)
         if c.legs:
             self.legs.write(x, legs)

@@ -291,7 +291,10 @@ class ContactProgram(ABC):
         )
 
     def with_clearance(self: Program, constraints: Mapping[ClearanceKey, SeparatingDirection]) -> Program:
-        """The same program with exactly these clearance constraints."""
+        """The same program with exactly these clearance constraints, of those at its nodes."""
+        # Another mesh of the contact has other nodes there.
+        places = {place.name for place, _ in self.body_spots}
+        constraints = {key: held for key, held in constraints.items() if key.place in places}
         other = copy.copy(self)
         other.builder = self._without_clearance.copy()
         order = add_clearance_constraints(other.builder, self.body_spots, constraints)

@@ -34,6 +34,7 @@ class ContactSet:
     shares : fraction of the contact's time that each phase lasts, which places the freezes of a frozen model;
         (): those of a point mass.
     after : add the position after the expected target's collision as variables.
+    lifted : add the positions during that collision as variables (`Collision.spots`).
 
     Attributes
     ----------
@@ -48,7 +49,14 @@ class ContactSet:
     """
 
     def __init__(
-        self, b: Builder, contact: Contact, elements: Elements = (), shares: Shares = (), *, after: bool
+        self,
+        b: Builder,
+        contact: Contact,
+        elements: Elements = (),
+        shares: Shares = (),
+        *,
+        after: bool,
+        lifted: bool = False,
     ) -> None:
         self._b, self.contact = b, contact
         p = b.problem
@@ -73,7 +81,7 @@ class ContactSet:
             for k, s in enumerate((s for s in p.scenarios if not s.missing), start=1)
         ]
         own = b.limits.of_y if after else None
-        self.expected = kind(b, contact, self.stages, number=0, after=own, **common)
+        self.expected = kind(b, contact, self.stages, number=0, after=own, lifted=lifted, **common)
         if p.first_instant:
             self.first = [FirstInstant(b, contact, c.law, c.suffix) for c in self.lasting]
 

@@ -315,6 +315,7 @@ def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Ar
             map_stages(collision, old_collision, new, x)
         if _model(t) != _model(old):
             collision.guess_model(new, *state)
+        collision.write_positions(new)
     if len(t.hit.first) != len(old.hit.first):
         for first in t.hit.first:
             first.guess(new, *state)

@@ -39,11 +39,13 @@ class MoreNodes(NamedTuple):
 
     swing, follow : of the swing, and of all motions to rest.
     stands : of each stance phase; empty of the one with the impact.
+    contact : whether the collocation points of the contact are nodes for clearance.
     """
 
     swing: tuple[float, ...] = ()
     follow: tuple[float, ...] = ()
     stands: tuple[tuple[float, ...], ...] = ()
+    contact: bool = False
 
     @property
     def total(self) -> int:
@@ -84,6 +86,7 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
         tuple(sorted({*known.swing, *found[0, blow]})),
         tuple(sorted({*known.follow, *found[2, blow]})),
         tuple(tuple(sorted(places)) for places in stands),
+        known.contact,
     )
 
 

@@ -151,7 +151,7 @@ class Transcription(ContactProgram):
         self.before = PhaseSequence(b, before, lambda begins, _: Swing(b, nodes.swing, begins), nodes)
         self.swing = cast(Swing, self.before.phases[problem.blow])
         contact = Contact(self.swing.end, *add_coasting(b))
-        super().__init__(b, ContactSet(b, contact, elements, shares, after=False))
+        super().__init__(b, ContactSet(b, contact, elements, shares, after=False, lifted=nodes.contact))
         self.after = [
             PhaseSequence(b, after, lambda _, ends: FollowThrough(b, nodes.follow, ends=ends), nodes)
         ]
@@ -315,6 +315,8 @@ class Transcription(ContactProgram):
             instances += other.link_after()
         if self.abort is not None:
             instances += self.abort.link(hit.contact)
+        at_stages = 3 * len(instances)
+        instances += hit.expected.link_positions() if isinstance(hit.expected, Collision) else []
         at = b.add_block("link", instances, np.zeros(0))
         labels, first = self.coordinates.labels, at + 3 * np.arange(b.ny)
         far, fast = along(labels, "off"), rates(labels)
@@ -330,6 +332,9 @@ class Transcription(ContactProgram):
         for other in hit.scenarios:
             outputs = first + 1 + 3 * b.ny * other.number
             b.equal("state after contact", f"position{other.suffix}", labels, outputs, far)
+        for i, (place, _) in enumerate(self._contact_spots):
+            outputs = first + 1 + at_stages + 3 * b.ny * i
+            b.equal("position in contact", place, labels, outputs, far)
 
     # ------------------------------------------------------------------ structure
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
@@ -401,6 +406,10 @@ class Transcription(ContactProgram):
             BodyState(0, place.name, begin + s * swing, self.posture(x, slots))
             for s, (place, slots) in zip(self.swing.nodes, found, strict=True)
         ]
+        out += [
+            BodyState(1, place.name, plan.contact_start + float(since), self.posture(x, slots))
+            for since, (place, slots) in zip(plan.collision.time[1:], self._contact_spots, strict=False)
+        ]
         for missed, follow in enumerate(self.follows):
             curve, begin, nodes, _ = plan.segment(2, missed=bool(missed))
             out += [
@@ -431,7 +440,12 @@ class Transcription(ContactProgram):
     @cached_property
     def body_spots(self) -> list[tuple[Place, list[Affine]]]:
         stands = [spot for sequence in (self.before, *self.after) for spot in sequence.spots()]
-        return [*self.swing_spots(), *self.follow_spots(), *stands]
+        return [*self.swing_spots(), *self._contact_spots, *self.follow_spots(), *stands]
+
+    @property
+    def _contact_spots(self) -> list[tuple[Place, list[Affine]]]:
+        expected = self.hit.expected
+        return expected.spots() if isinstance(expected, Collision) else []
 
     def displacement(self, x: Array, time: Array) -> tuple[Array, Array]:
         plan = self.decode(x)
@@ -467,7 +481,8 @@ def statement_of(t: Transcription) -> str:
     """JSON summary of a program, which a reader understands without this package.
 
     `groups`: name, count and size of the groups of variables, in their order. `constraints`: by term, place
-    and the index of a list in `components`. `added_nodes`: beside the mesh's own, as of `MoreNodes`.
+    and the index of a list in `components`. `added_nodes`, `nodes_in_contact`: beside the mesh's own, as of
+    `MoreNodes`.
     `elements`, `guarded`, `shares`, `shortest`: of the contact; its least durations [s] by collision.
     `clearance`: fields of `ClearanceKey` and `SeparatingDirection`.
     """
@@ -494,6 +509,7 @@ def statement_of(t: Transcription) -> str:
             "constraints": constraints,
             "components": list(component_lists),
             "added_nodes": [list(t.nodes.swing), list(t.nodes.follow), *map(list, t.nodes.stands)],
+            "nodes_in_contact": t.nodes.contact,
             "elements": t.hit.elements if collisions else [],
             "guarded": t.hit.guarded,
             "shares": list(t.hit.shares),

@@ -55,6 +55,7 @@ Array = NDArray[np.float64]
 EARLY = 0.12  # [s] before contact: from then on no corner of the striking link is beyond the target's plane
 # [m], [m/s], [m/s] how far the striker keeps off the target's plane; and a tool in a soft grip after contact
 CLEARANCE, HASTE, PARTING = 0.02, 0.04, 0.12
+IN_CONTACT = "position in contact"  # of variables and their rows
 _KNOWN_TERMS = (
     *map(type, DEFAULT_TERMS),
     FirstTouch,
@@ -108,6 +109,7 @@ class Program:
         self.problem, self.robot = problem, robots[problem.blow]
         self.limits = Limits(problem, self.robot)
         self._names = {name for name, _, _ in claims.groups}
+        self._stages = sum(count for name, count, _ in claims.groups if name == IN_CONTACT)
         self.missing = unknown(problem)
         self.rows: list[Piece] = []
         self.worth: list[Piece] = []
@@ -258,11 +260,14 @@ class Program:
         def posture(way: Way, at: Callable[[Variables], Any], k: int, v: Variables) -> Array:
             return way.robot.posture(at(v)[0], v.get(f"{way.kind} legs", k))
 
+        def in_contact(i: int, v: Variables) -> Array:
+            return self.robot.posture(v.get(IN_CONTACT, i), self.blows[0].get(v, "collision legs", i))
+
         return {
             way.place(float(s)): partial(posture, way, way.at(float(s)), k)
             for way in (*self.ways, *self.stands)
             for k, s in enumerate(way.nodes)
-        }
+        } | {self.blows[0].place(i): partial(in_contact, i) for i in range(self._stages)}
 
     def _tendons(self) -> None:
         """Sums of joint angles in their ranges, at all nodes."""
@@ -482,6 +487,12 @@ class Program:
 
             rows = [("state after contact", f"position{other.suffix}", labels, 0.0, 0.0)]
             self.rows.append(Piece.of(after, rows))
+        for i in range(self._stages):
+
+            def lies(v: Variables, i: int = i) -> Array:
+                return v.get(IN_CONTACT, i) - blow.moved(v, i, self.at_contact(v))[0]
+
+            self.rows.append(Piece.of(lies, [(IN_CONTACT, blow.place(i), labels, 0.0, 0.0)]))
         if p.abort_after is None:
             return
         late: float = p.abort_after

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ from impactopt.planning.clearance_constraints import Margins, Watch, node_placem
 from impactopt.robots.couplings import Tendon
 from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.initial_guess import first_iterate
+from impactopt.transcription.mesh import MoreNodes
 from impactopt.transcription.transcription import Transcription, statement_of
 from oracle.kkt import lagrangian_gradient
 from oracle.program import Program, unknown
@@ -113,6 +115,25 @@ def test_of_bodies_that_are_kept_apart(biped_transcription: Transcription) -> No
     rows = Watch(t, Margins(dataclasses.replace(t.problem, terms=())), first_iterate(t)).constraints(0.15)
     assert len(rows) > 100
     check_rows(t.with_clearance(rows))
+
+
+@pytest.mark.parametrize("model", ["full", "sdc"])
+@pytest.mark.parametrize("build", [arm_problem, biped_problem])
+def test_of_bodies_that_are_kept_apart_in_contact(build: Callable[[], Any], model: str) -> None:
+    problem = dataclasses.replace(build(), collision=model)
+    t = transcribed(problem, MoreNodes(contact=True))
+    rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).constraints(0.5)
+    assert any("compression" in row.place for row in rows)
+    if model == "full":  # the oracle does not know frozen models
+        check_rows(t.with_clearance(rows))
+    x = first_iterate(t)
+    off = [k for k, o in enumerate(t.constraints.origins) if o.term == "position in contact"]
+    assert np.abs(t.program.constraints(x)[off]).max() < 1e-12
+    states, plan = [s for s in t.body_states(x) if s.phase == 1], t.decode(x)
+    share = (np.array([s.time for s in states]) - plan.contact_start) / plan.collision.time[-1]
+    np.testing.assert_allclose(
+        [t.coordinates.split(s.q)[0] for s in states], plan.through_contact(share), atol=1e-12
+    )
 
 
 def test_of_bodies_that_are_kept_apart_from_a_target_that_friction_pushes_aside() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
 from impactopt import (
+    FreeMass,
     GainFactor,
     Ground,
     ImpactProblem,
@@ -20,8 +22,10 @@ from impactopt import (
     Obstacle,
     SelfCollision,
     Solution,
+    SpringDamper,
     Status,
     load_problem,
+    load_solution,
     solve,
 )
 from impactopt.bodies.clearance import Places
@@ -226,3 +230,23 @@ def test_a_lost_clearance_of_two_links_names_its_section(free: Solution) -> None
     margins._required = {pair: 2.0 for pair in map(tuple, margins.bodies.shapes.pairs) if pair[1] >= 0}
     found = BetweenNodes(budget, margins).refined(Outcome.of(program_of(free, problem), free.result)).result
     assert found.status is Status.ACCEPTABLE and "[terms.self_collision] margin_m" in found.message
+
+
+@pytest.mark.slow
+def test_bodies_keep_apart_during_a_long_contact(tmp_path: Path) -> None:
+    """A shove of 0.8 s, in which a link other than the striker would enter the target."""
+    problem = dataclasses.replace(
+        load_problem("arm7"),
+        target=FreeMass(mass=80.0),
+        law=SpringDamper(stiffness=1500.0, damping=12.0),
+        contact_duration=(0.0, 0.5),
+    )
+    solution = solve(problem)
+    assert solution.status is Status.SOLVED and solution.nodes.contact
+    assert solution.clearance()["clearance_mm"] > 0 and not solution.clearance()["contacts_besides"]
+    replayed = solution.validate()
+    assert replayed.impulse == pytest.approx(solution.impulse, rel=6e-3)
+    solution.save(tmp_path / "shove")
+    again = load_solution(tmp_path / "shove")
+    assert again.nodes == solution.nodes
+    np.testing.assert_array_equal(again.result.x, solution.result.x)

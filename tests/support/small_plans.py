@@ -27,6 +27,7 @@ from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipm.interior_point import IPMOptions, solve_ipm
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
+from impactopt.transcription.mesh import NO_MORE, MoreNodes
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 from support.small_robots import arm, biped, striking_point
@@ -73,8 +74,8 @@ def arm_problem() -> ImpactProblem:
     )
 
 
-def transcribed(problem: ImpactProblem) -> Transcription:
-    return Transcription(problem, block_functions(problem))
+def transcribed(problem: ImpactProblem, nodes: MoreNodes = NO_MORE) -> Transcription:
+    return Transcription(problem, block_functions(problem), nodes)
 
 
 def struck(problem: ImpactProblem) -> StrikeTranscription:

@@ -40,6 +40,7 @@ from impactopt.planning.refinement import Attempt, Outcome
 from impactopt.problem.feasibility import overlapping
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads, weight_of
+from impactopt.simulation.result import check_simulations
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_refinement import ContactError
 from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares, contact_elements
@@ -404,8 +405,13 @@ class Solution(Solved):
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """Entries of ``summary.json``, with ``simulated``, and ``replayed`` on free soles, if these are
         given.
+
+        Raises
+        ------
+        InputError : one of these is no `Simulation`, or of another plan; `simulation` missed the target.
         """
         plan = self.plan
+        check_simulations(self.trajectory, simulation=simulation, replay=replay)
         expected, *others = self._collisions
         out: dict[str, Any] = {
             **self.outcome(),

@@ -24,6 +24,7 @@ from impactopt.planning.lazy_constraints import gear_caution, with_lazy_constrai
 from impactopt.planning.refinement import Outcome
 from impactopt.planning.solution import Solution, program_on, solution_of
 from impactopt.planning.solve import solve
+from impactopt.problem.hashing import shapes_hash
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
 from impactopt.simulation.controller import ControllerSettings, controller_of
@@ -131,7 +132,10 @@ class Planned:
 
 def _may_be_of(record: Record, problem: ImpactProblem) -> bool:
     """True unless a record's plan is known to be of another problem."""
-    return record.summary.get("problem", {}).get("hash") in (None, problem.hash)
+    known = record.summary.get("problem", {})
+    if known.get("hash") not in (None, problem.hash):
+        return False
+    return "shapes" not in known or known["shapes"] == shapes_hash(problem.robot)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

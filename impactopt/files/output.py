@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.codegen.files import write_atomically
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_kind
 from impactopt.files.problem_file.reading import change_data
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.record import FORMAT, NUMBERS, SUMMARY, Record, load_record, plain, read_json
@@ -66,8 +66,11 @@ def record_of(
 
     Raises
     ------
-    InputError : a simulation or a replay that is no `Simulation`, or is of another plan.
+    InputError : no `Solution`; a simulation or a replay that is no `Simulation`, or is of another plan.
     """
+    from impactopt.planning.solution import Solution
+
+    check_kind("solution", solution, Solution)
     plan, robot, result = solution.plan, solution.problem.robot, solution.result
     if simulation is not None or replay is not None:  # a trajectory may not be completed
         check_simulations(solution.trajectory, simulation=simulation, replay=replay)

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_choice
+from impactopt.errors import InputError, check_choice, check_kind
 from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.clearance_constraints import Margins, same_bodies
 from impactopt.planning.lazy_constraints import LazyTerms
@@ -171,6 +171,7 @@ def _one_at_a_time(run: Callable[P, R]) -> Callable[P, R]:
 
 
 def parametric_program(solution: Solution) -> ParametricProgram:
+    check_kind("solution", solution, Solution)
     if not solution.status.usable:
         raise InputError(
             f"this plan is not a solution ({solution.status.value}) and has no sensitivities: solve it first"
@@ -357,6 +358,7 @@ def moved_solution(
     options : default tolerances are `REPLANNING_TOLERANCES`.
     changes : as of `impactopt.planning.parameter_changes.moved_problem`.
     """
+    check_kind("solution", solution, Solution)
     for name in changes:
         check_choice("moved: a plan has no parameter", name, MOVABLE)
     problem = moved_problem(solution.problem, **changes)

@@ -96,8 +96,8 @@ def slides_beyond(term: Slide, plan: Plan) -> str:
     far = float(np.abs(_offsets(plan)).max())
     if far <= (1 + SLIDE_TOLERANCE) * term.most:
         return ""
-    most = f"at most {1e3 * term.most:.0f} mm allowed"
-    return f"the striking point slides {1e3 * far:.0f} mm across the target, {most}"
+    most = f"at most {1e3 * term.most:.3g} mm allowed"
+    return f"the striking point slides {1e3 * far:.3g} mm across the target, {most}"
 
 
 def reference_beyond(term: ReferenceRange, plan: Plan) -> str:

@@ -372,8 +372,10 @@ def with_limits_kept(
         elif beyond := _joints_beyond(plan, robot):
             message = f"Between nodes {beyond}; give more `intervals`, or more time."
         elif term in plan.problem.on_demand and (far := slides_beyond(term, plan)):
-            message = f"Between collocation points {far}; give more `compression` and "
-                "`restitution` elements in [collision]."
+            message = (
+                f"Between collocation points {far}; give more elements in `compression` and `restitution` of "
+                "[collision]."
+            )
         else:
             return result
         return replace(result, status=Status.ACCEPTABLE, message=message)

@@ -154,24 +154,25 @@ def _slightly_changed(problem: ImpactProblem) -> ImpactProblem:
 
 
 _known: WeakKeyDictionary[Solution, ParametricProgram] = WeakKeyDictionary()
-_alone = threading.RLock()
+_locks: WeakKeyDictionary[Solution, Any] = WeakKeyDictionary()
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def _one_at_a_time(run: Callable[P, R]) -> Callable[P, R]:
-    """The function, for one thread at a time: all calls for a solution move one program."""
+    """The function, for one thread at a time of each solution: all calls for it move one program."""
 
     @wraps(run)
     def locked(*args: P.args, **options: P.kwargs) -> R:
-        with _alone:
+        solution: Any = args[0] if args else options.get("solution")
+        check_kind("solution", solution, Solution)
+        with _locks.setdefault(solution, threading.RLock()):
             return run(*args, **options)
 
     return locked
 
 
 def parametric_program(solution: Solution) -> ParametricProgram:
-    check_kind("solution", solution, Solution)
     if not solution.status.usable:
         raise InputError(
             f"this plan is not a solution ({solution.status.value}) and has no sensitivities: solve it first"
@@ -358,7 +359,6 @@ def moved_solution(
     options : default tolerances are `REPLANNING_TOLERANCES`.
     changes : as of `impactopt.planning.parameter_changes.moved_problem`.
     """
-    check_kind("solution", solution, Solution)
     for name in changes:
         check_choice("moved: a plan has no parameter", name, MOVABLE)
     problem = moved_problem(solution.problem, **changes)

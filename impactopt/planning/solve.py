@@ -34,7 +34,14 @@ from impactopt.planning.lazy_constraints import (
     window_caution,
     with_lazy_constraints,
 )
-from impactopt.planning.models import carried_start, check_start, overloaded, with_order, with_order_of
+from impactopt.planning.models import (
+    carried_start,
+    check_start,
+    endless,
+    overloaded,
+    with_order,
+    with_order_of,
+)
 from impactopt.planning.multistart import Guesses, best_of, best_of_starts, check_starts, drawn_guesses
 from impactopt.planning.oracles import BetweenNodes, MotionPrice, with_first_scale
 from impactopt.planning.refinement import Guess, Oracle, Outcome, refine
@@ -166,7 +173,7 @@ def _planned(
     solver = PlanSolver(budget=budget, margins=margins, refined=refined and margins is not None)
     if isinstance(start, Solution) and same_bodies(t.problem, start.problem):
         t = t.with_clearance(start.clearance_constraints)
-    doubts, built = overloaded(t.problem), time.perf_counter()
+    doubts, built = overloaded(t.problem) + endless(t.problem), time.perf_counter()
     # A start's draw depends on seed and number only, so further ones continue the sequence.
     guesses = partial(_guesses, t, given, range(which.start, last), seed)
     # A solution of a similar problem is more than an estimate, so with one all iterations are allowed.

@@ -22,6 +22,7 @@ from impactopt import (
     ImpactProblem,
     InputError,
     KelvinVoigt,
+    NotSolvedWarning,
     RigidWall,
     Scenario,
     SpringDamper,
@@ -328,6 +329,22 @@ def test_a_model_that_is_far_off_is_told(model: str) -> None:
     told = f"{model!r} is off by {off:+.2g} % against full dynamics" if model != "full" else ""
     assert told in found.summary().get("caution", "")
     assert bool(found.caution) == (model != "full")
+
+
+@pytest.mark.slow
+def test_a_contact_that_does_not_end_by_the_papers_model_is_the_reason() -> None:
+    """Its arm has no torque that takes it back from a door; the solver searched for minutes."""
+    door = dataclasses.replace(
+        load_problem("arm7"),
+        law=SpringDamper(stiffness=6e3, damping=800.0),
+        target=FreeMass(mass=50.0),
+        contact_duration=(0.01, 0.1),
+    )
+    with pytest.warns(NotSolvedWarning, match="By the collision model 'sdc-paper' it has not ended"):
+        found = solve(dataclasses.replace(door, collision="sdc-paper"))
+    assert found.status is Status.INFEASIBLE
+    assert 'plan with collision.model = "full"' in found.result.message
+    assert solve(door).status is Status.SOLVED
 
 
 @pytest.mark.slow

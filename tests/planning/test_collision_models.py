@@ -20,6 +20,7 @@ from impactopt import (
     HertzDamped,
     HuntCrossley,
     ImpactProblem,
+    Impulse,
     InputError,
     KelvinVoigt,
     NotSolvedWarning,
@@ -339,6 +340,7 @@ def test_a_contact_that_does_not_end_by_the_papers_model_is_the_reason() -> None
         law=SpringDamper(stiffness=6e3, damping=800.0),
         target=FreeMass(mass=50.0),
         contact_duration=(0.01, 0.1),
+        objectives=(Impulse(),),
     )
     with pytest.warns(NotSolvedWarning, match="By the collision model 'sdc-paper' it has not ended"):
         found = solve(dataclasses.replace(door, collision="sdc-paper"))

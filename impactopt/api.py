@@ -138,7 +138,7 @@ class Solution(solution.Solution):
         Raises
         ------
         InputError : they cannot be written; a problem that no file can have (`write_problem`), as one with
-            classes of your own. Pickle keeps such a solution.
+            classes of your own. Pickle keeps such a solution, for the same version of the package.
         """
         from impactopt.files.output import keep_record, make_directory, record_of
         from impactopt.files.problem_file import write_problem

@@ -237,6 +237,7 @@ def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path,
         _drafted(tmp_path, text, motion=motion)
 
 
+@pytest.mark.slow
 def test_a_ram_is_told_that_drafted_nails_are_struck_from_above(tmp_path: Path) -> None:
     """It could drive one ahead, in a file drafted without a motion; the message named no direction."""
     body, ram = (urdfs.link(name, 2.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)) for name in ("base", "ram"))

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.output import replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
@@ -24,7 +25,6 @@ from impactopt.planning.lazy_constraints import gear_caution, with_lazy_constrai
 from impactopt.planning.refinement import Outcome
 from impactopt.planning.solution import Solution, program_on, solution_of
 from impactopt.planning.solve import solve
-from impactopt.problem.hashing import shapes_hash
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
 from impactopt.simulation.controller import ControllerSettings, controller_of
@@ -135,7 +135,7 @@ def _may_be_of(record: Record, problem: ImpactProblem) -> bool:
     known = record.summary.get("problem", {})
     if known.get("hash") not in (None, problem.hash):
         return False
-    return "shapes" not in known or known["shapes"] == shapes_hash(problem.robot)
+    return "shapes" not in known or known["shapes"] == bodies_of(problem.robot).hash
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.codegen.cache import canonical, model_hash
 from impactopt.contact.laws import CustomLaw
 from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS
@@ -22,7 +21,7 @@ DIGITS = 16  # 64 bits: the probability that two of a million problems share a h
 
 def problem_hash(problem: Any) -> str:
     """Hexadecimal hash of what an `ImpactProblem`'s solution depends on, but for the collision shapes of the
-    robot's links (`shapes_hash`), the same in every process.
+    robot's links (`RobotBodies.hash`), the same in every process.
 
     It does not depend on the names of problem and robot, the order of terms and objectives, postures other
     than the start, or on whether a default is given or left out. Numbers count to the last digit.
@@ -57,14 +56,6 @@ def problem_hash(problem: Any) -> str:
         "objectives": sorted(canonical(_plain(objective)) for objective in problem.objectives),
     }
     return hashlib.sha256(canonical(_plain(data)).encode()).hexdigest()[:DIGITS]
-
-
-def shapes_hash(robot: Robot) -> str:
-    """Hexadecimal hash of the hulls of a robot's links (`impactopt.bodies`), to the micrometre."""
-    hulls = sorted(
-        (piece.link, sorted(np.round(1e6 * piece.vertices).tolist())) for piece in bodies_of(robot).pieces
-    )
-    return hashlib.sha256(canonical(_plain(hulls)).encode()).hexdigest()[:DIGITS]
 
 
 def _robot(robot: Robot, striker: str) -> dict[str, Any]:

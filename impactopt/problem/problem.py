@@ -12,6 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Bodies
+from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.world import (
     Ground,
     Obstacle,
@@ -34,7 +35,7 @@ from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance, support_polygon
 from impactopt.problem import checks
 from impactopt.problem.checks import COLLISIONS, INSTANT
-from impactopt.problem.hashing import problem_hash, shapes_hash
+from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective
 from impactopt.problem.objectives.base import check_objectives
@@ -558,7 +559,7 @@ class ImpactProblem:
             "hash": self.hash,
         }
         if self.keeps_apart:
-            out["shapes"] = shapes_hash(self.robot)
+            out["shapes"] = bodies_of(self.robot).hash
         if not self.stands:
             out["ground"] = "none" if self.ground_height is None else f"z = {self.ground_height:g} m"
         if self.collision != "full":

@@ -52,6 +52,7 @@ from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import drawn_posture
 from impactopt.solvers.program import Callback, SolverResult, Status
+from impactopt.transcription.contact_refinement import finest
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.mesh import NO_MORE
 from impactopt.transcription.strike import StrikeTranscription
@@ -321,8 +322,7 @@ def _with_limits_kept(outcome: Outcome[Transcription]) -> Outcome[Transcription]
     # the robot's own gains are not those of the plan while these are open
     if outcome.result.status is not Status.SOLVED or t.problem.gains:
         return outcome
-    error, hit = at.contact_error, at.planned.collision
-    hit = error.finer[0] if error is not None and error.finer else hit
+    hit, *_ = finest(at.planned, at.contact_error)
     return replace(outcome, result=with_limits_kept(outcome.result, at.planned, hit, t.problem.robot))
 
 

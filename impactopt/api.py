@@ -65,8 +65,9 @@ class Solution(solution.Solution):
         of the active set. These are quick; constraints then hold to a thousandth if the status is
         "acceptable", and with another status the result is not usable. Bounds that this plan was made
         without, on gear loads, slides and clearance, are not checked then: see `loads` and :meth:`clearance`.
-        ``refine=True`` also refines the mesh, as `impactopt.solve` does; without it `loads` and margins in
-        contact are those at the collocation points, which may be exceeded between them by some per cent.
+        ``refine=True`` also refines the mesh, as `impactopt.solve` does; without it `loads`, margins in
+        contact and ``collision.peak_force`` are those at the collocation points, which may be exceeded
+        between them by some per cent; `summary` has the peak force of the `contact_replay`.
         ``callback``, ``options`` and ``time_limit`` are those of `impactopt.solve`, but for looser tolerances
         of the optimum, with which the impulse is within 0.1 %; constraints are met as usual.
 
@@ -138,7 +139,7 @@ class Solution(solution.Solution):
         Raises
         ------
         InputError : they cannot be written; a problem that no file can have (`write_problem`), as one with
-            classes of your own. Pickle keeps such a solution.
+            classes of your own. Pickle keeps such a solution, for the same version of the package.
         """
         from impactopt.files.output import keep_record, make_directory, record_of
         from impactopt.files.problem_file import write_problem

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -41,6 +42,12 @@ class RobotBodies:
     pieces: tuple[Piece, ...]
     source: str
     too_large: tuple[Piece, ...] = ()
+
+    @cached_property
+    def hash(self) -> str:
+        """Hexadecimal hash of the hulls, to the micrometre, in any order of links and vertices."""
+        hulls = sorted((p.link, sorted((np.round(1e6 * p.vertices) + 0.0).tolist())) for p in self.pieces)
+        return hashlib.sha256(repr(hulls).encode()).hexdigest()[:16]
 
     @cached_property
     def joints(self) -> tuple[int, ...]:

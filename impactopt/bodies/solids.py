@@ -233,7 +233,7 @@ def read_mesh(path: Path, scale: Array) -> Solid:
     if not len(solid.triangles):
         raise ValueError("there are no triangles in it")
     if not np.isfinite(solid.vertices).all():
-        raise ValueError("it has corners that are nowhere")
+        raise ValueError("coordinates of its vertices are NaN or infinite")
     return solid
 
 

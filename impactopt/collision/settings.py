@@ -277,6 +277,7 @@ def coasting_reference(
     ------
     InputError : wrong shapes or NaN; soles that are not in place; a time that is not positive.
     """
+    check_kind("coordinates", coordinates, StanceCoordinates)
     c, robot = coordinates, coordinates.robot
     q, v = robot.check_configuration(q), robot.check_velocity(v)
     check_positive("until [s]", until)

@@ -28,7 +28,7 @@ from impactopt.files.toml import read_toml, write_toml
 from impactopt.kinematics.stance import corners_at, support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
-from impactopt.simulation.result import Simulation, state_at_contact
+from impactopt.simulation.result import Simulation, check_simulations
 from impactopt.solvers.program import SolverResult, Status
 
 if TYPE_CHECKING:  # reading a record does not import the planner
@@ -39,7 +39,6 @@ if TYPE_CHECKING:  # reading a record does not import the planner
 # of 2 rad): with 24, accelerations are beyond what `verify` allows. Replays have 15 (3e-5 rad, 15 mN of
 # 1 kN), which is finer than pictures and measurements.
 BITS = {"reference": 32, "missed": 32, "pose": 32, "simulated": 15, "replayed": 15}
-SAME_STATE = 1e-6  # [rad], [rad/s], [m], [m/s] between the states of one plan at contact, computed twice
 SMALLEST = 1e-30  # instead of the largest value of a channel that is zero
 # files derived from a result: of `impactopt show`, of `impactopt validate`, and pictures
 DERIVED = (
@@ -67,22 +66,14 @@ def record_of(
 
     Raises
     ------
-    InputError : a simulation or a replay that is no `Simulation`, or is of another plan.
+    InputError : no `Solution`; a simulation or a replay that is no `Simulation`, or is of another plan.
     """
+    from impactopt.planning.solution import Solution
+
+    check_kind("solution", solution, Solution)
     plan, robot, result = solution.plan, solution.problem.robot, solution.result
-    for name, given in (("simulation", simulation), ("replay", replay)):
-        if given is None:
-            continue
-        check_kind(name, given, Simulation)
-        other = given.q.shape[1] != robot.model.nq
-        if not (other or np.isnan(given.expected)):  # nan: unknown
-            # the begin alone is that of all plans whose swing has a given duration
-            own = state_at_contact(solution.trajectory)
-            other = given.expected != solution.trajectory.contact_start or not np.allclose(
-                given.expected_state, own, rtol=0.0, atol=SAME_STATE
-            )
-        if other:
-            raise InputError(f"{name} is of another plan: give this solution's, of validate()")
+    if simulation is not None or replay is not None:  # a trajectory may not be completed
+        check_simulations(solution.trajectory, simulation=simulation, replay=replay)
     arrays = _scene_arrays(solution.problem)
     parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}
     parts |= {"collision": solution.collision, "solver": result}

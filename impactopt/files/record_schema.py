@@ -111,7 +111,8 @@ _START = {
 }
 _PROBLEM = {
     **dict.fromkeys(
-        ("name?", "robot?", "striker?", "target?", "target_body?", "law?", "hash?", "collision?"), _TEXT
+        ("name?", "robot?", "striker?", "target?", "target_body?", "law?", "hash?", "shapes?", "collision?"),
+        _TEXT,
     ),
     **dict.fromkeys(("point_m?", "normal?"), ([(int, float)],)),
     **dict.fromkeys(("scenarios?", "objectives?", "off?", "gains?"), ([_TEXT],)),

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.output import replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
@@ -131,7 +132,10 @@ class Planned:
 
 def _may_be_of(record: Record, problem: ImpactProblem) -> bool:
     """True unless a record's plan is known to be of another problem."""
-    return record.summary.get("problem", {}).get("hash") in (None, problem.hash)
+    known = record.summary.get("problem", {})
+    if known.get("hash") not in (None, problem.hash):
+        return False
+    return "shapes" not in known or known["shapes"] == bodies_of(problem.robot).hash
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

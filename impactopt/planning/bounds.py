@@ -312,13 +312,20 @@ def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> It
         name, _ = t.program.describe_violation(worst, x, float(violations[worst]))
         where = f"; {name.partition(', ')[2]}"
     for field in fields(term):
-        old = getattr(term, field.name)
+        given = getattr(term, field.name)
+        by_joint = isinstance(given, Mapping)
+        old = 1.0 if by_joint else given  # a table by joint is searched for a factor of all its numbers
         # Only numbers are searched for a value; an infinite one bounds nothing.
         if isinstance(old, bool) or not isinstance(old, float) or not np.isfinite(old):
             continue
 
-        def violation_at(value: float, name: str = field.name) -> float:
-            p = changed(t.problem, terms=with_term(t.problem, replace(term, **{name: value})))
+        def at(value: float, name: str = field.name, given: Any = given) -> Term:
+            table = isinstance(given, Mapping)
+            new = {joint: value * one for joint, one in given.items()} if table else value
+            return replace(term, **{name: new})
+
+        def violation_at(value: float, at: Callable[[float], Term] = at) -> float:
+            p = changed(t.problem, terms=with_term(t.problem, at(value)))
             return _violation(
                 program_for(t.with_clearance({}), p), x, select, torques=type(term) is TorqueLimit
             )
@@ -328,8 +335,9 @@ def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> It
             continue
         value = _outward(needed, old)
         unit = about_field[field.name].unit if field.name in about_field else ""
-        text = f"{term.name}: {value:.3g} instead of {old:.3g}{' ' + unit if unit else ''}"
-        new = changed_or_none(t.problem, terms=with_term(t.problem, replace(term, **{field.name: value})))
+        instead = f"instead of {old:.3g}{' ' + unit if unit else ''}"
+        text = f"{term.name}: {value:.3g} {'times the limit of each joint' if by_joint else instead}"
+        new = changed_or_none(t.problem, terms=with_term(t.problem, at(value)))
         yield Cause(kind=kind, text=f"{text} ({section}{field.name}{where})", problem=new)
 
 

@@ -8,6 +8,7 @@ contact and under its own reference.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -245,19 +246,43 @@ def _coasting(problem: ImpactProblem, strike: PlannedStrike) -> Trajectory:
     )
 
 
-def model_error(t: ContactProgram, x: Array) -> ModelError | None:
-    """Error of a program's collision model against full dynamics, for solver variables (n,).
+def model_error(t: ContactProgram, x: Array, planned: Plan | PlannedStrike) -> ModelError | None:
+    """Error of a program's collision model against full dynamics, for solver variables (n,), as planned.
 
     None for full dynamics, for an impact with a given restitution, and if a contact does not end.
     """
     problem, c = t.problem, t.coordinates
     if problem.collision in ("full", "auto", "rigid"):
         return None
+    duration = max(sum(t.expected.durations(x)), 1e-2)
+    if not problem.lasts:  # the virtual mass: half a period on the contact's spring
+        duration = np.pi * float(np.sqrt(mass_at_contact(problem) / problem.law.parameters["stiffness"]))
+        if isinstance(planned, Plan):
+            return _error_without_duration(problem, planned, duration)
     y, legs = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x)
     q, v, _ = c.complete_motion(y, t.u0.read(x)[0], np.zeros(c.ny), legs)
     # The variable is scaled by the limit.
     torque = t.feedforward.read(x)[0] * problem.robot.torque_limit
-    return collision_error(problem, q, v, torque, max(sum(t.expected.durations(x)), 1e-2))
+    return collision_error(problem, q, v, torque, duration)
+
+
+def _error_without_duration(problem: ImpactProblem, plan: Plan, duration: float) -> ModelError | None:
+    """Error of a plan's impulse without duration against a contact of about this duration [s].
+
+    Its reference does not coast in contact, but begins the follow-through at once, which takes impulse away.
+    """
+    with contextlib.suppress(InputError):  # legs out of reach
+        found = follow_contact(
+            problem.robot,
+            plan.coarse_reference,
+            scene_of(problem),
+            step=min(_MAX_STEP, duration / _MIN_STEPS),
+            until=duration,
+            longest=_MAX_REPLAY_LENGTH * duration,
+        )
+        if found.impulse > 0:
+            return ModelError(impulse_pct=100 * (plan.impulse / found.impulse - 1), zmp_mm=None)
+    return None
 
 
 def collision_error(

@@ -29,13 +29,14 @@ from impactopt.planning.bounds import (
 )
 from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.clearance_constraints import Margins, deepest_penetration
-from impactopt.planning.lazy_constraints import with_lazy_constraints
+from impactopt.planning.lazy_constraints import slides_beyond, with_lazy_constraints
 from impactopt.planning.parameter_changes import changed, with_parameter
 from impactopt.planning.refinement import program_for
 from impactopt.problem.checks import met_once
 from impactopt.problem.feasibility import too_weak
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import LONGEST, SHORTEST, Phase
+from impactopt.problem.terms import Slide
 from impactopt.robots.loads import shortfalls
 from impactopt.robots.robot import Robot
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
@@ -356,11 +357,13 @@ def with_reason(
 def with_limits_kept(
     result: SolverResult, plan: Plan, collision: PlannedCollision, robot: Robot
 ) -> SolverResult:
-    """A solved result itself if its plan keeps at least half of each sole's margin between nodes, too, and no
-    joint is beyond the robot's limits; else with the status acceptable, and a message that names them.
+    """A solved result itself if its plan keeps at least half of each sole's margin between nodes, too, no
+    joint is beyond the robot's limits, and the slide is within its own; else with the status acceptable, and
+    a message that names them.
 
     collision : of the plan, on a finer mesh if there is one.
     """
+    term = plan.problem.term(Slide)
     with contextlib.suppress(InputError):  # legs out of reach: completing the motion reports it
         if short := shortfalls(plan.sole_margins(collision)):
             message = (
@@ -368,6 +371,11 @@ def with_limits_kept(
             )
         elif beyond := _joints_beyond(plan, robot):
             message = f"Between nodes {beyond}; give more `intervals`, or more time."
+        elif term in plan.problem.on_demand and (far := slides_beyond(term, plan)):
+            message = (
+                f"Between collocation points {far}; give more elements in `compression` and `restitution` of "
+                "[collision]."
+            )
         else:
             return result
         return replace(result, status=Status.ACCEPTABLE, message=message)

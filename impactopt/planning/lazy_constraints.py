@@ -23,6 +23,7 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.result import FACE
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.collision import Collision
+from impactopt.transcription.contact_refinement import finest
 from impactopt.transcription.mesh import GEAR
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, plan_loads, strike_loads
 from impactopt.transcription.transcription import Transcription
@@ -96,8 +97,8 @@ def slides_beyond(term: Slide, plan: Plan) -> str:
     far = float(np.abs(_offsets(plan)).max())
     if far <= (1 + SLIDE_TOLERANCE) * term.most:
         return ""
-    most = f"at most {1e3 * term.most:.0f} mm allowed"
-    return f"the striking point slides {1e3 * far:.0f} mm across the target, {most}"
+    most = f"at most {1e3 * term.most:.3g} mm allowed"
+    return f"the striking point slides {1e3 * far:.3g} mm across the target, {most}"
 
 
 def reference_beyond(term: ReferenceRange, plan: Plan) -> str:
@@ -288,16 +289,14 @@ class LazyTerms(Generic[Program]):
 
     def _gears(self, outcome: Outcome[Program]) -> list[DriveLoads]:
         """Gear loads of a solution."""
-        error = outcome.at.contact_error if self._finer else None
-        finer = () if error is None else error.finer
-        return _loads(outcome.program.robot, outcome.at.planned, finer)
+        planned, error = outcome.at.planned, outcome.at.contact_error if self._finer else None
+        return _loads(outcome.program.robot, planned, finest(planned, error))
 
 
 def _loads(
-    robot: Robot, planned: Plan | PlannedStrike, finer: tuple[PlannedCollision, ...]
+    robot: Robot, planned: Plan | PlannedStrike, collisions: list[PlannedCollision]
 ) -> list[DriveLoads]:
     """Gear and motor loads of all motions and all collisions."""
-    collisions = finer or [planned.collision, *(scenario.collision for scenario in planned.scenarios)]
     if isinstance(planned, PlannedStrike):
         # Gear loads do not depend on the jump of velocities.
         zero = np.zeros(robot.nv)

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.collision.sdc import frozen_model
 from impactopt.contact.laws import KelvinVoigt
 from impactopt.contact.targets.base import is_order
 from impactopt.errors import InputError, shortened
@@ -41,8 +42,9 @@ _MODELS = ("sdc", "full")
 # Least force over what gears bear, from which on a problem is infeasible: both are of point masses, in the
 # posture of the initial guess.
 _FAR_BEYOND = 2.0
-# Speed at which the first model is tested: part of the fastest impact's; or [m/s] if that is unbounded.
-_TEST_FRACTION, _TEST_SPEED = 0.5, 1.0
+# Speed at which a model is tested: part of the fastest impact's; and [m/s] of that one if it is unbounded.
+_TEST_FRACTION, _USUAL_SPEED = 0.5, 2.0
+_ENDLESS = 5.0  # [s] after which a contact does not end
 
 
 def check_start(start: Solved, problem: ImpactProblem, *, motion: bool) -> None:
@@ -190,6 +192,49 @@ def overloaded(problem: ImpactProblem) -> list[str]:
     ]
 
 
+def endless(problem: ImpactProblem) -> list[str]:
+    """Message that a contact does not end by the paper's model, in the posture of the initial guess; none if
+    it does, or nothing is known.
+
+    That model has no feed-forward, servo stiffness or gravity, so nothing takes the hand back from a heavy
+    target on a contact that damps more than it springs.
+    """
+    if problem.collision != "sdc-paper" or problem.target.guards:
+        return []
+    names = ("robot", "striker", "normal", "law", "target", "stance")
+    scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
+    try:
+        model = frozen_model(problem.collision, **scene, horizon=_ENDLESS)
+        tested = [_state_at_contact(problem, part) for part in (_TEST_FRACTION, _TEST_FRACTION / 5)]
+        ends = [model.collide(*state, require_separation=False).separated for _, state in tested]
+    except InputError:  # no posture to test in
+        return []
+    if any(ends):
+        return []
+    return [
+        f"contact. By the collision model {problem.collision!r} it has not ended after {_ENDLESS:g} s, in "
+        f"the posture of the initial guess at {tested[0][0]:.2g} and {tested[1][0]:.2g} m/s; plan with "
+        'collision.model = "full"'
+    ]
+
+
+def _state_at_contact(problem: ImpactProblem, part: float) -> tuple[float, tuple[Array, Array, Array]]:
+    """Part of the fastest impact's speed [m/s], or of `_USUAL_SPEED` if that is unbounded; and a state at
+    contact in the posture of the initial guess with it: q (nq,), v (nv,) and the torque that holds it (n,).
+
+    Raises
+    ------
+    InputError : legs out of reach.
+    """
+    c, fastest = problem.coordinates, fastest_at_contact(problem)
+    speed = part * (fastest if np.isfinite(fastest) else _USUAL_SPEED)
+    y, legs = c.split(problem.contact_posture)
+    legs = c.solve_legs(y, legs)
+    rates = strike_rates(c, problem.strikers, y, legs, speed * problem.normal)
+    q, v, _ = c.complete_motion(y, rates, np.zeros(c.ny), legs)
+    return speed, (q, v, holding_torque(problem.robot, q, v, stance=problem.stance))
+
+
 def with_order_of(start: Solved, problem: ImpactProblem) -> ImpactProblem:
     """Problem with the order of contact events of the solution that it starts from.
 
@@ -257,19 +302,12 @@ def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
     if with_order(replace(problem, collision=_MODELS[1]), lambda _: None).order:
         say(f"{_MODELS[0]} has one contact, in which point masses part too early: {_MODELS[1]} at once")
         return True
-    first, c = replace(problem, collision=_MODELS[0]), problem.coordinates
-    y, legs = c.split(problem.contact_posture)
-    most = fastest_at_contact(problem)
-    speed = _TEST_FRACTION * most if np.isfinite(most) else _TEST_SPEED
     try:
-        legs = c.solve_legs(y, legs)
-        rates = strike_rates(c, problem.strikers, y, legs, speed * problem.normal)
-        q, v, _ = c.complete_motion(y, rates, np.zeros(c.ny), legs)
-        torque = holding_torque(problem.robot, q, v, stance=problem.stance)
+        speed, state = _state_at_contact(problem, _TEST_FRACTION)
     # No posture to test in: the model is tried in a program.
     except InputError:
         return False
-    error = collision_error(first, q, v, torque, 0.05)
+    error = collision_error(replace(problem, collision=_MODELS[0]), *state, 0.05)
     if error is not None and good_enough(problem, error):
         return False
     estimate = error or "no estimate of its error"

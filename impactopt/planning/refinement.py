@@ -116,7 +116,7 @@ class Evaluation(Generic[Program]):
         problem = self.program.problem
         if problem.gains:
             return None
-        error = model_error(self.program, self.x)
+        error = model_error(self.program, self.x, self.planned)
         return PlannedContact(problem=problem, planned=self.planned, model_error=error)
 
     @property

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_choice
+from impactopt.errors import InputError, check_choice, check_kind
 from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.clearance_constraints import Margins, same_bodies
 from impactopt.planning.lazy_constraints import LazyTerms
@@ -154,17 +154,19 @@ def _slightly_changed(problem: ImpactProblem) -> ImpactProblem:
 
 
 _known: WeakKeyDictionary[Solution, ParametricProgram] = WeakKeyDictionary()
-_alone = threading.RLock()
+_locks: WeakKeyDictionary[Solution, Any] = WeakKeyDictionary()
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def _one_at_a_time(run: Callable[P, R]) -> Callable[P, R]:
-    """The function, for one thread at a time: all calls for a solution move one program."""
+    """The function, for one thread at a time of each solution: all calls for it move one program."""
 
     @wraps(run)
     def locked(*args: P.args, **options: P.kwargs) -> R:
-        with _alone:
+        solution: Any = args[0] if args else options.get("solution")
+        check_kind("solution", solution, Solution)
+        with _locks.setdefault(solution, threading.RLock()):
             return run(*args, **options)
 
     return locked

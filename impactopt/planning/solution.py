@@ -40,8 +40,9 @@ from impactopt.planning.refinement import Attempt, Outcome
 from impactopt.problem.feasibility import overlapping
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads, weight_of
+from impactopt.simulation.result import check_simulations
 from impactopt.solvers.program import SolverResult, Status, Violation
-from impactopt.transcription.contact_refinement import ContactError
+from impactopt.transcription.contact_refinement import ContactError, finest
 from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares, contact_elements
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, Trajectory, motion_loads
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -368,19 +369,7 @@ class Solution(Solved):
     @property
     def collision(self) -> PlannedCollision:
         """The expected collision, on the finer mesh of the error estimate if there is one."""
-        return self._collisions[0]
-
-    @property
-    def _collisions(self) -> list[PlannedCollision]:
-        """The expected collision and those of the scenarios, on the finer mesh of the error estimate if there
-        is one, as torque and ZMP may be worse between the program's points. The outcomes are those of the
-        plan.
-        """
-        planned = [self.plan.collision, *(scenario.collision for scenario in self.plan.scenarios)]
-        if self.contact_error is None or not self.contact_error.finer:
-            return planned
-        finer = zip(self.contact_error.finer, planned, strict=True)
-        return [replace(new, outcome=old.outcome) for new, old in finer]
+        return finest(self.plan, self.contact_error)[0]
 
     def margins(self) -> dict[str, dict[str, float]]:
         """ZMP margin [m] and ratio of torque demand to limit, by phase, as of `Plan.margins`."""
@@ -404,9 +393,14 @@ class Solution(Solved):
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """Entries of ``summary.json``, with ``simulated``, and ``replayed`` on free soles, if these are
         given.
+
+        Raises
+        ------
+        InputError : one of these is no `Simulation`, or of another plan; `simulation` missed the target.
         """
         plan = self.plan
-        expected, *others = self._collisions
+        check_simulations(self.trajectory, simulation=simulation, replay=replay)
+        expected, *others = finest(self.plan, self.contact_error)
         out: dict[str, Any] = {
             **self.outcome(),
             **impact_summary(plan, expected, self.contact_replay),

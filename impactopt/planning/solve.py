@@ -34,7 +34,14 @@ from impactopt.planning.lazy_constraints import (
     window_caution,
     with_lazy_constraints,
 )
-from impactopt.planning.models import carried_start, check_start, overloaded, with_order, with_order_of
+from impactopt.planning.models import (
+    carried_start,
+    check_start,
+    endless,
+    overloaded,
+    with_order,
+    with_order_of,
+)
 from impactopt.planning.multistart import Guesses, best_of, best_of_starts, check_starts, drawn_guesses
 from impactopt.planning.oracles import BetweenNodes, MotionPrice, with_first_scale
 from impactopt.planning.refinement import Guess, Oracle, Outcome, refine
@@ -45,6 +52,7 @@ from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import drawn_posture
 from impactopt.solvers.program import Callback, SolverResult, Status
+from impactopt.transcription.contact_refinement import finest
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.mesh import NO_MORE
 from impactopt.transcription.strike import StrikeTranscription
@@ -166,7 +174,7 @@ def _planned(
     solver = PlanSolver(budget=budget, margins=margins, refined=refined and margins is not None)
     if isinstance(start, Solution) and same_bodies(t.problem, start.problem):
         t = t.with_clearance(start.clearance_constraints)
-    doubts, built = overloaded(t.problem), time.perf_counter()
+    doubts, built = overloaded(t.problem) + endless(t.problem), time.perf_counter()
     # A start's draw depends on seed and number only, so further ones continue the sequence.
     guesses = partial(_guesses, t, given, range(which.start, last), seed)
     # A solution of a similar problem is more than an estimate, so with one all iterations are allowed.
@@ -314,8 +322,7 @@ def _with_limits_kept(outcome: Outcome[Transcription]) -> Outcome[Transcription]
     # the robot's own gains are not those of the plan while these are open
     if outcome.result.status is not Status.SOLVED or t.problem.gains:
         return outcome
-    error, hit = at.contact_error, at.planned.collision
-    hit = error.finer[0] if error is not None and error.finer else hit
+    hit, *_ = finest(at.planned, at.contact_error)
     return replace(outcome, result=with_limits_kept(outcome.result, at.planned, hit, t.problem.robot))
 
 

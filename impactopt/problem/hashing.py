@@ -21,7 +21,7 @@ DIGITS = 16  # 64 bits: the probability that two of a million problems share a h
 
 def problem_hash(problem: Any) -> str:
     """Hexadecimal hash of what an `ImpactProblem`'s solution depends on, but for the collision shapes of the
-    robot's links, the same in every process.
+    robot's links (`RobotBodies.hash`), the same in every process.
 
     It does not depend on the names of problem and robot, the order of terms and objectives, postures other
     than the start, or on whether a default is given or left out. Numbers count to the last digit.

@@ -12,6 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Bodies
+from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.world import (
     Ground,
     Obstacle,
@@ -557,6 +558,8 @@ class ImpactProblem:
             "law": repr(self.law),
             "hash": self.hash,
         }
+        if self.keeps_apart:
+            out["shapes"] = bodies_of(self.robot).hash
         if not self.stands:
             out["ground"] = "none" if self.ground_height is None else f"z = {self.ground_height:g} m"
         if self.collision != "full":

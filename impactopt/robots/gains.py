@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from impactopt.contact.fields import about
-from impactopt.errors import InputError, check_array, check_number
+from impactopt.errors import InputError, check_array, check_kind, check_number
 from impactopt.robots.actuators import fitting
 from impactopt.robots.robot import Robot
 from impactopt.robots.tools import grip_limits, replaced_grips
@@ -68,6 +68,8 @@ def scaled_gains(robot: Robot, factors: Mapping[str, float]) -> Robot:
     InputError : a name that matches no joint; a factor out of range; gains too fast for the inertia that they
         act on.
     """
+    check_kind("robot", robot, Robot)
+    check_kind("factors", factors, Mapping)
     each = np.ones(robot.n)
     for pattern, given in factors.items():
         factor = check_number(f"gains of {pattern!r}", given)

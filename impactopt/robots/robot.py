@@ -92,6 +92,10 @@ class Robot:
     tendons: tuple[Tendon, ...] = ()
 
     def __post_init__(self) -> None:
+        check_kind("model", self.model, pin.Model)
+        check_kind("strikers", self.strikers, Mapping)
+        check_kind("postures", self.postures, Mapping)
+        build.check_parts("soles", self.soles, Sole)
         checks.check_joint_types(self.model)
         checks.check_joints(self.joint_names, self.name)
         for name in ("kp", "kd", "torque_limit", "velocity_limit", "lower", "upper"):
@@ -236,6 +240,7 @@ class Robot:
         gravity (3,) : [m/s2], world axes; default the model's.
         tendons : ranges of sums of joint angles.
         """
+        check_kind("model", model, pin.Model)
         build.check_parts("soles", soles, Sole)
         build.check_parts("strikers", strikers, Striker)
         model = model.copy()

@@ -14,7 +14,7 @@ from scipy.integrate import cumulative_trapezoid
 from impactopt.contact.friction import ContactFriction, moves_target
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_kind
 from impactopt.robots.loads import DriveLoads, cop_margin, least_margins
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import Solids, UnintendedContact
@@ -407,6 +407,25 @@ def state_at_contact(reference: Any) -> Array:
     """Configuration and velocity (nq + nv,) of a reference at the begin of contact."""
     k = np.flatnonzero(reference.phase == 0)[-1]
     return np.concatenate([reference.q[k], reference.v[k]])
+
+
+SAME_STATE = 1e-6  # [rad], [rad/s], [m], [m/s] between the states of one plan at contact, computed twice
+
+
+def check_simulations(reference: Any, **simulations: Any) -> None:
+    """InputError unless all simulations that are given (not None) are of a plan with this reference."""
+    for name, given in simulations.items():
+        if given is None:
+            continue
+        check_kind(name, given, Simulation)
+        other = given.q.shape[1] != reference.q.shape[1]
+        if not (other or np.isnan(given.expected)):  # nan: unknown
+            # the begin alone is that of all plans whose swing has a given duration
+            other = given.expected != reference.contact_start or not np.allclose(
+                given.expected_state, state_at_contact(reference), rtol=0.0, atol=SAME_STATE
+            )
+        if other:
+            raise InputError(f"{name} is of another plan: give this solution's, of validate()")
 
 
 _NEXT, _PREVIOUS = [1, 2, 0], [2, 0, 1]  # axes

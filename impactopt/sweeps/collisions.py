@@ -35,7 +35,7 @@ from impactopt.collision.checks import FREEZE_ERROR, too_large
 from impactopt.collision.outputs import HISTORIES, OF_SERVO
 from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.symbolic import SymbolicModel
-from impactopt.errors import InputError, did_you_mean, raw_array
+from impactopt.errors import InputError, check_kind, did_you_mean, raw_array
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file
 from impactopt.files.toml import Place, plain_value
 
@@ -393,6 +393,8 @@ def collide_many(
     ------
     InputError : unknown keys or outputs; columns of different lengths; values that the problem file refuses.
     """
+    check_kind("columns", columns, Mapping)
+    check_kind("at_contact", at_contact or {}, Mapping)
     file = problem if isinstance(problem, ProblemFile) else read_problem_file(problem)
     collisions = Collisions(file, at_contact or {}, outputs, keys=tuple(columns))
     given = {key: np.atleast_1d(raw_array(key, values)) for key, values in columns.items()}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_number
 from impactopt.planning.solution import versions
 from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.cluster import connected, on_cluster
@@ -98,7 +98,7 @@ def sweep(
     """
     if sum(x is not None for x in (workers, scheduler, client)) > 1:
         raise InputError("give one of workers, scheduler and client: a cluster brings its own workers")
-    if workers is not None and workers < 1:
+    if workers is not None and check_number("workers", workers) < 1:
         raise InputError(f"{workers} workers; ask for at least 1")
     pyarrow()
     chosen = _read(source)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,7 +25,7 @@ from impactopt.transcription.contact_set import ContactSet, approaches
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
 from impactopt.transcription.layout import Affine, Array, Index
 from impactopt.transcription.mesh import GEAR, CollocationPoint, Elements, halved, lagrange
-from impactopt.transcription.plan import PlannedCollision, gear_share
+from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, gear_share
 from impactopt.transcription.structured import StructuredProgram
 
 TOLERANCE_PCT = 0.5  # [%] of the impulse: an error that does not justify another solve
@@ -61,6 +61,16 @@ class ContactError:
     missed: bool
     strained: tuple[tuple[bool, ...], ...] = ()
     finer: tuple[PlannedCollision, ...] = field(default=(), repr=False, compare=False)
+
+
+def finest(planned: Plan | PlannedStrike, error: ContactError | None) -> list[PlannedCollision]:
+    """The expected collision and those of the scenarios, on the finer mesh of the error estimate if there is
+    one, as torque and ZMP may be worse between the program's points. The outcomes are those of the plan.
+    """
+    collisions = [planned.collision, *(scenario.collision for scenario in planned.scenarios)]
+    if error is None or not error.finer:
+        return collisions
+    return [replace(new, outcome=old.outcome) for new, old in zip(error.finer, collisions, strict=True)]
 
 
 def contact_error(t: ContactProgram, x: Array) -> ContactError | None:

@@ -699,6 +699,7 @@ MESHES = {
     "pointer.stl": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
     "cut.stl": (b"\0" * 80 + (99).to_bytes(4, "little") + b"\0" * 60, "cannot be read"),
     "empty.stl": (b"\0" * 80 + (0).to_bytes(4, "little"), "no triangles"),
+    "nan.stl": (b"\0" * 80 + (1).to_bytes(4, "little") + b"\xff" * 50, "vertices are NaN or infinite"),
     "broken.obj": (b"f 1 2", "cannot be read"),
     "gone.stl": (None, "not found"),
 }

@@ -237,6 +237,15 @@ def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path,
         _drafted(tmp_path, text, motion=motion)
 
 
+@pytest.mark.slow
+def test_a_ram_is_told_that_drafted_nails_are_struck_from_above(tmp_path: Path) -> None:
+    """It could drive one ahead, in a file drafted without a motion; the message named no direction."""
+    body, ram = (urdfs.link(name, 2.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)) for name in ("base", "ram"))
+    slide = urdfs.joint("slide", "base", "ram", "1 0 0", (0.0, 0.0, 1.0), (-3.0, 3.0), kind="prismatic")
+    with pytest.raises(InputError, match=r"from above, as drafted nails .* draft it without --motion"):
+        _drafted(tmp_path, urdfs.robot("ram", body, ram, slide), motion="nail")
+
+
 def test_a_hand_waits_ahead_of_its_shoulder_wherever_on_its_axis_a_joint_is_given(tmp_path: Path) -> None:
     """The same robot, with the frames of both first shoulder joints in the middle of the trunk."""
     text = moved = urdfs.biped()

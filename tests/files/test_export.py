@@ -87,7 +87,7 @@ def planned(arm: Solution) -> Planned:
 def filed(planned: Planned) -> Record:
     """The plan's record as if its problem were that of a file."""
     path = problem_file("arm_planar")
-    own = {**planned.record.summary["problem"], "hash": load_problem(path).hash}
+    own = planned.record.summary["problem"] | load_problem(path).describe()
     return dataclasses.replace(
         planned.record,
         problem=path.read_text(encoding="utf-8"),

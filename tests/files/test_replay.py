@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from support import urdfs
 from support.fake_solution import still_problem, still_solution
+from support.problem_texts import bolted_arm
 from typer.testing import CliRunner
 
-from impactopt import InputError, Perturbation, Solution, load_record
+from impactopt import InputError, Perturbation, Solution, load_problem, load_record
 from impactopt.cli.app import app
 from impactopt.cli.validate import validate
 from impactopt.files.named_problems import problem_file
@@ -176,6 +178,28 @@ def test_a_problem_that_has_changed_since_its_plan_is_told(saved: Path, tmp_path
         UserWarning, match="heavier is another one today .* after a change of its robot's files"
     ):
         assert not load_planned(heavier).of_other_problem
+
+
+def test_a_link_that_has_grown_since_the_plan_is_told(saved: Path, tmp_path: Path) -> None:
+    """The plan keeps clear of the old shape."""
+    file, shapes = tmp_path / "arm.toml", []
+    for size in ("0.08 0.08 0.3", "0.5 0.08 0.3"):
+        (tmp_path / "robot.urdf").write_text(urdfs.arm().replace("0.08 0.08 0.3", size, 1), "utf-8")
+        text = bolted_arm(
+            frame="wrist_link",
+            tip=[0.0, 0.0, 0.1],
+            point=[0.6, 0.0, 0.5],
+            normal=[1.0, 0.0, 0.0],
+            start="raised",
+            postures={"raised": {"shoulder": 0.5, "elbow": 1.0}},
+        )
+        file.write_text(text, "utf-8")
+        shapes.append(load_problem(file).describe()["shapes"])
+    assert shapes[0] != shapes[1]
+    summary = load_record(saved).summary
+    known = {**summary, "problem": {**summary["problem"], "shapes": shapes[0]}}
+    with pytest.warns(UserWarning, match="grown is another one today"):
+        load_planned(resaved(saved, tmp_path / "grown", summary=known))
 
 
 def test_a_result_without_a_motion_has_nothing_to_replay(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from impactopt import (
     FreeMass,
     ImpactProblem,
     Impulse,
+    JointAcceleration,
     Nail,
     NotSolvedWarning,
     Obstacle,
@@ -32,6 +33,7 @@ from impactopt.planning.bounds import bounds_of
 from impactopt.planning.budget import stopping
 from impactopt.planning.diagnosis import with_reason
 from impactopt.problem.feasibility import too_weak
+from impactopt.transcription.initial_guess import first_iterate
 
 
 @pytest.fixture(scope="module")
@@ -196,3 +198,20 @@ def test_a_wide_range_of_durations_starts_from_a_usual_one(arm: ImpactProblem) -
     """From the middle of 0.4 to 50 s the arm would be guessed nearly still at contact."""
     wide = dataclasses.replace(arm.swing, duration=(0.4, 50.0))
     assert solve(dataclasses.replace(arm, swing=wide)).status.usable
+
+
+def test_a_limit_by_joint_is_named_as_one_for_all_joints_is() -> None:
+    """At the same motion, the same accelerations are allowed."""
+    found = {}
+    names = arm_problem().robot.joint_names
+    for kind, limit in {"of all": 2.0, "by joint": dict.fromkeys(names, 2.0)}.items():
+        terms = (*BODILESS, JointAcceleration(limit=limit))
+        t = transcribed(dataclasses.replace(arm_problem(), terms=terms))
+        (bound,) = [b for b in bounds_of(t) if b.name == "joint acceleration"]
+        (found[kind],) = bound.causes(first_iterate(t))
+    problems = [cause.problem for cause in found.values()]
+    assert all(problems)
+    allowed = [p.term(JointAcceleration).limit for p in problems if p is not None]
+    assert allowed[0] > 2.0
+    assert allowed[1] == pytest.approx(dict.fromkeys(names, allowed[0]), rel=0.01)
+    assert f"{allowed[1][names[0]] / 2:.3g} times the limit of each joint" in found["by joint"].text

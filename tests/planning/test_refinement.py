@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impactopt import Status
+from impactopt import Slide, Status
 from impactopt.planning.budget import Budget, rank_of
 from impactopt.planning.diagnosis import with_limits_kept
 from impactopt.planning.refinement import Additions, Guess, Outcome, refine
@@ -113,6 +113,16 @@ def test_a_joint_beyond_its_limit_between_nodes_makes_a_plan_acceptable(
     found = with_limits_kept(*given, weaker)
     assert found.status is Status.ACCEPTABLE
     assert f"elbow has 1.05 times its {limit} limit" in found.message
+
+
+def test_a_slide_beyond_its_limit_between_points_makes_a_plan_acceptable(hammered: Solution) -> None:
+    """The limit is lowered below the slide, along the tangent in the arm's plane."""
+    for share, status in ((1.05, Status.ACCEPTABLE), (0.99, Status.SOLVED)):
+        terms = (*hammered.problem.terms, Slide(most=hammered.slide / share))
+        plan = replace(hammered.plan, problem=replace(hammered.problem, terms=terms))
+        found = with_limits_kept(hammered.result, plan, hammered.collision, plan.problem.robot)
+        assert found.status is status
+        assert (f"slides {1e3 * hammered.slide:.3g} mm across" in found.message) == (share > 1)
 
 
 def test_an_attempt_that_fails_worse_is_listed_too() -> None:

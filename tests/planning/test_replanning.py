@@ -153,6 +153,22 @@ def test_threads_that_move_one_plan_at_once_get_the_plans_that_they_ask_for(arm:
     assert [first, *others] == [arm.moved(mass=mass).impulse for mass in (light, heavy)]
 
 
+def test_a_plan_is_moved_while_another_one_is(arm: Solution) -> None:
+    """They share no program, so neither waits for the other."""
+    mass, another = arm.problem.target.parameters["mass"], dataclasses.replace(arm)
+    moved: list[float] = []
+    second = threading.Thread(target=lambda: moved.append(another.moved(mass=0.98 * mass).impulse))
+
+    def meanwhile(_: Any) -> None:
+        if second.ident is None:
+            second.start()
+            second.join(timeout=60.0)
+            assert moved
+
+    first = arm.moved(mass=1.04 * mass, callback=meanwhile).impulse
+    assert [*moved, first] == [arm.moved(mass=factor * mass).impulse for factor in (0.98, 1.04)]
+
+
 def test_a_program_with_other_numbers_is_that_of_its_problem(arm: Solution) -> None:
     """What takes the numbers of another program has its functions."""
     bent = parametric_program(arm)

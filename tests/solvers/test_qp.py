@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -202,3 +204,11 @@ def test_solvers_that_are_gone_name_their_replacement(name):
 @pytest.mark.parametrize("name", ["osqp"])
 def test_no_time_is_no_answer(name):
     assert not make_qp_solver(name).solve(random_qp(0, 60, 90, 8), time_limit=0.0).usable
+
+
+@pytest.mark.parametrize("name", ["P", "A"])
+def test_a_sparse_matrix_is_named(name):
+    """NumPy's message was of an array element that is a sequence."""
+    dense = random_qp(0, 3, 2, 1)
+    with pytest.raises(InputError, match=f"{name} of a quadratic program is a csc_matrix; give a dense"):
+        dataclasses.replace(dense, **{name: sp.csc_matrix(getattr(dense, name))})

@@ -560,9 +560,15 @@ def _aimed(
         if not wrong:
             return aimed
         first = first or wrong[0]
+    posture, remedy = "the drafted posture", "write the problem file by hand (docs/howto/robot.md)"
+    if way[2] < 0:
+        posture += " and from above, as drafted nails and boards are"
+        remedy = (
+            "draft it without --motion, and give that file [target] and [contact] of `impactopt new "
+            "arm_planar` (a nail) or `chop_arm` (a board)"
+        )
     raise InputError(
-        f"no target is found that {striker!r} can hit from the drafted posture; write the problem file by "
-        f"hand (docs/howto/robot.md){f': {first}' if first else ''}"
+        f"no target is found that {striker!r} can hit from {posture}; {remedy}{f': {first}' if first else ''}"
     )
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from impactopt.errors import InputError, check_choice
+from impactopt.errors import InputError, check_choice, check_kind
 from impactopt.files.export.content import check_export, export_of, write_directory
 from impactopt.files.output import record_of
 from impactopt.files.replay import Planned
@@ -73,6 +73,7 @@ def export(
         then.
     """
     check_choice("there is no format", to, FORMATS)
+    check_kind("solution", solution, Solution)
     default = FORMATS[to].rate
     # first, as computing the record takes time
     check_export(solution.status.value, solution.problem.robot, default if rate is None else rate, joints)

@@ -186,6 +186,7 @@ def write_problem(
     """
     data = problem_data(problem, folder=folder)
     if solver is not None:
+        check_kind("solver", solver, SolverSettings)
         data["solver"] = _solver(solver)
     read = problem_file_from_data(data, where=Path(folder) / "problem.toml")
     if read.build().hash != problem.hash:

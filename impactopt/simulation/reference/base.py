@@ -14,7 +14,7 @@ from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.collision.settings import Effects, JointFriction, Settings, constant_reference, servo_settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.contact.friction import check_friction, tangential_mobility
-from impactopt.errors import InputError, check_array, check_positive
+from impactopt.errors import InputError, check_array, check_kind, check_positive
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -184,6 +184,8 @@ class ReferenceModel(CollisionModel):
         super().__post_init__()
         check_positive("step [s]", self.step)
         check_positive("tolerance", self.tolerance)
+        if self.friction is not None:
+            check_kind("friction", self.friction, JointFriction)
         check_friction("contact_friction", self.contact_friction, self.target)
         self._settings(self.kp, self.kd)
 

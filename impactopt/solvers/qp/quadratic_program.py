@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 import scipy.linalg as la
 
+from impactopt.errors import InputError
 from impactopt.solvers.program import Vector, row_norms
 
 
@@ -27,6 +28,10 @@ class QuadraticProgram:
     A : (m, n), dense.
     lower, upper : (m,), equal for equalities, +-inf for none.
     x_lower, x_upper : (n,), likewise.
+
+    Raises
+    ------
+    InputError : P or A is no dense array.
     """
 
     P: np.ndarray
@@ -36,6 +41,12 @@ class QuadraticProgram:
     upper: Vector
     x_lower: Vector
     x_upper: Vector
+
+    def __post_init__(self) -> None:
+        for name in ("P", "A"):
+            if not isinstance(given := getattr(self, name), np.ndarray):
+                kind = type(given).__name__
+                raise InputError(f"{name} of a quadratic program is a {kind}; give a dense array")
 
     @property
     def n(self) -> int:

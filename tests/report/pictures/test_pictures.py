@@ -405,6 +405,9 @@ def test_simulations_of_another_plan_are_refused(arm_plan: Planned) -> None:
     for other in (later, dataclasses.replace(own, q=np.zeros((len(own.time), 9)))):
         with pytest.raises(InputError, match="simulation is of another plan: give this solution's"):
             solution.plot("force", simulation=other)
+        with pytest.raises(InputError, match="replay is of another plan"):
+            solution.summary(replay=other)
+    assert solution.summary(own)["simulated"]["impulse_Ns"] == pytest.approx(own.impulse)
 
 
 @pytest.mark.slow
@@ -427,6 +430,8 @@ def test_arguments_of_other_types_are_refused(arm_plan: Planned, tmp_path: Path,
         solution.plot("force", **given)
     if name == "ax":
         return
+    with pytest.raises(InputError, match=f"{name} must be a Simulation, not 3"):
+        solution.summary(**given)
     with pytest.raises(InputError, match=f"{name} must be a Simulation, not 3"):
         solution.animate(**given)
     with pytest.raises(InputError, match=f"{name} must be a Simulation, not 3"):

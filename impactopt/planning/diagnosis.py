@@ -382,6 +382,16 @@ def with_limits_kept(
     return result
 
 
+def lost_in_contact(plan: Plan, collision: PlannedCollision) -> bool:
+    """True if a plan loses limits of soles or of the slide between collocation points; collision: as of
+    `with_limits_kept`.
+    """
+    term = plan.problem.term(Slide)
+    if shortfalls(plan.sole_margins(collision), "collision"):
+        return True
+    return term in plan.problem.on_demand and bool(slides_beyond(term, plan))
+
+
 def _joints_beyond(plan: Plan, robot: Robot) -> str:
     """Message with the joint that is farthest beyond the robot's limit of velocity or torque; "" if none."""
     worst, message = 1 + VIOLATED, ""

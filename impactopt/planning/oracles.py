@@ -20,11 +20,11 @@ from impactopt.planning.clearance_constraints import (
     solve_with_clearance,
 )
 from impactopt.planning.contact_replay import ACCEPTABLE_WITHIN, SOLVED_WITHIN
-from impactopt.planning.diagnosis import MAX_NAMED
+from impactopt.planning.diagnosis import MAX_NAMED, lost_in_contact
 from impactopt.planning.refinement import Additions, Guess, Outcome, program_for, refine, start_of
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.solvers.program import SolverResult, Status
-from impactopt.transcription.contact_refinement import TOLERANCE_PCT, all_halved, refined_elements
+from impactopt.transcription.contact_refinement import TOLERANCE_PCT, all_halved, finest, refined_elements
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import Elements, contact_elements, nodes_to_add
 from impactopt.transcription.transcription import Transcription
@@ -120,6 +120,12 @@ class BetweenNodes:
                 nodes = nodes_to_add(outcome.at.planned, for_clearance)
             error = outcome.at.contact_error
             elements = refined_elements(error, t.hit.elements)
+            # open gains: the robot's own are not those of the plan
+            if elements is None and not t.problem.gains:
+                with contextlib.suppress(InputError):
+                    planned = outcome.at.planned
+                    lost = lost_in_contact(planned, finest(planned, error)[0])
+                    elements = all_halved(t.hit.elements) if lost else None
             # freezes are at given shares of the contact's duration: other durations need other elements
             shares = t.hit.drifted(x) or shares
             if shares != t.hit.shares:

@@ -193,16 +193,18 @@ def least_margins(
     return {"sole_cop_margin_mm": least(1e3 * cop, stands), "sole_force_N": least(force, loaded)}
 
 
-def shortfalls(numbers: Mapping[str, Any]) -> list[str]:
+def shortfalls(numbers: Mapping[str, Any], only: str = "") -> list[str]:
     """Messages about margins below what is required between nodes, worst first.
 
     numbers : least margins (`least_margins`) and required ones, keys as in ``summary.json``.
+    only : a phase; "": all.
     """
     asked, found = numbers.get("sole_cop_margin_asked_mm") or {}, []
     for name, phases in (numbers.get("sole_cop_margin_mm") or {}).items():
         for phase, kept in phases.items():
             if (
                 phase in asked
+                and only in ("", phase)
                 and kept < (least := 1e3 * margin_between_nodes(1e-3 * asked[phase])) - ROUNDING
             ):
                 what = f"centre of pressure of the sole {name!r}, {phase}"
@@ -210,7 +212,7 @@ def shortfalls(numbers: Mapping[str, Any]) -> list[str]:
     force = numbers.get("sole_force_asked_N") or 0.0
     for name, phases in (numbers.get("sole_force_N") or {}).items():
         for phase, kept in phases.items():
-            if kept < SHARE * force - ROUNDING:
+            if only in ("", phase) and kept < SHARE * force - ROUNDING:
                 what = f"normal force on the sole {name!r}, {phase}"
                 found.append((kept - SHARE * force, f"{what}: {kept:.0f} N kept of {force:g} N"))
     return [message for _, message in sorted(found)]

@@ -20,7 +20,7 @@ from impactopt.files.record import FORMAT, Record
 from impactopt.files.record_schema import check_summary
 from impactopt.kinematics.stance import margin
 from impactopt.report.pictures import PICTURES, save_pictures
-from impactopt.report.pictures.torque import _binned
+from impactopt.report.pictures.histories import _binned
 
 
 @pytest.fixture(scope="module")

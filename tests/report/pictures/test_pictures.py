@@ -29,7 +29,7 @@ from impactopt.kinematics.stance import zmp
 from impactopt.report.charts import charts_of
 from impactopt.report.pictures import PICTURES, hierarchy, overview
 from impactopt.report.pictures.compare import comparison_picture
-from impactopt.report.pictures.ellipsoid import effective_masses
+from impactopt.report.pictures.poses import effective_masses
 from impactopt.report.pictures.style import DPI, PAGE, Picture
 from impactopt.simulation.reference.poses import inverse_mass, poses_of
 

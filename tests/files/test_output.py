@@ -16,8 +16,7 @@ from support.fake_solution import MissingSolution, simulation_of, still_problem,
 
 from impactopt import ImpactProblem, InputError, Plan, Status, load_record
 from impactopt.files.output import record_of, save_record, write_file
-from impactopt.files.record import FORMAT, Record
-from impactopt.files.record_schema import check_summary
+from impactopt.files.record import FORMAT, Record, check_summary
 from impactopt.kinematics.stance import margin
 from impactopt.report.pictures import PICTURES, save_pictures
 from impactopt.report.pictures.histories import _binned

@@ -252,23 +252,28 @@ def test_cache_directory_follows_the_environment(monkeypatch: pytest.MonkeyPatch
 
 WORKER = """
 import sys, time
+from pathlib import Path
 import casadi as ca
 from impactopt.codegen.cache import FunctionGroup, cached, cached_groups
 def build():
     with open(sys.argv[1], "a") as log:
         log.write("built\\n")
-    time.sleep(1.0)  # long enough for the other process to come
+    while Path(sys.argv[2]).read_text().count("here") < 2:  # the other process comes
+        time.sleep(0.01)
+    time.sleep(0.2)  # and wants the function too
     x = ca.SX.sym("x", 3)
     return [ca.Function("value", [x], [2 * ca.sin(x) + x[0] * x])]
+with open(sys.argv[2], "a") as log:
+    log.write("here\\n")
 print(repr(float(cached("toy", (1,), build)["value"]([0.3, -1.2, 2.5])[1])))
 """
 
 
 @needs_compiler
 def test_two_processes_at_once_build_once(cache: Path, tmp_path: Path) -> None:
-    log = tmp_path / "log"
+    log, arrivals = tmp_path / "log", tmp_path / "arrivals"
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-W", "error", "-c", WORKER, str(log)]
+    command = [sys.executable, "-W", "error", "-c", WORKER, str(log), str(arrivals)]
     started = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env) for _ in range(2)]
     printed = [process.communicate(timeout=60)[0] for process in started]
     assert [process.returncode for process in started] == [0, 0]

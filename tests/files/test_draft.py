@@ -383,9 +383,7 @@ def test_legs_of_five_and_seven_and_a_waist_stand(
     assert [leg.before.size for leg in problem.coordinates.legs] == [extra, extra]
 
 
-@pytest.mark.parametrize(
-    "text", [urdfs.biped(), pytest.param(urdfs.arm(), marks=pytest.mark.slow)], ids=["biped", "arm"]
-)
+@pytest.mark.parametrize("text", [urdfs.biped(), urdfs.arm()], ids=["biped", "arm"])
 def test_the_contact_of_a_light_target_has_the_damping_ratio_of_the_papers(tmp_path: Path, text: str) -> None:
     """The paper's: 300 N s/m, 1e4 N/m, 5 kg."""
     problem = _problem(tmp_path, text)

@@ -69,6 +69,7 @@ def records(punch_record: Record, arm_record: Record) -> dict[str, Record]:
 BY_ROBOT = ("strobe", "ellipsoid", "iterations")
 DRAWN = [(which, name) for which in ("biped", "arm") for name in DRAWS]
 DRAWN += [(which, name) for which in ("plan alone", "missed") for name in DRAWS if name not in BY_ROBOT]
+DRAWN.remove(("plan alone", "overview"))  # whose parts are drawn each, and beside each other for the others
 
 
 @pytest.mark.parametrize(("which", "name"), DRAWN)

@@ -58,7 +58,7 @@ _PUBLIC = {
 }
 _EXPORTS = {name: module for module, names in _PUBLIC.items() for name in names}
 
-# families: the classes in their packages
+# families: the classes of their modules
 _FAMILIES = ("contact.laws", "contact.targets", "problem.objectives", "problem.terms")
 
 
@@ -67,7 +67,9 @@ def _all_exports() -> dict[str, str]:
     found = dict(_EXPORTS)
     for module in _FAMILIES:
         family = importlib.import_module(f"impactopt.{module}")
-        found |= {name: module for name, thing in vars(family).items() if isinstance(thing, type)}
+        classes = {name: thing for name, thing in vars(family).items() if isinstance(thing, type)}
+        own = {name for name, kind in classes.items() if kind.__module__.startswith(family.__name__)}
+        found |= dict.fromkeys(own, module)
     return found
 
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support.docs_blocks import BASE, PAGES, ROOT, check_line, languages, run_page, whole
 
-from impactopt import InputError
+import impactopt
+from impactopt import ImpactProblem, InputError, Solution, solve
 
 # `text`: what a program prints, pictures of words; braces: directives of the site
 KNOWN = ("python", "toml", "sh", "text")
-WITH_BLOCKS = [
-    page if page.name == "README.md" else pytest.param(page, marks=pytest.mark.slow)
-    for page in PAGES
-    if {"python", "toml", "sh"} & set(languages(page))
-]
+WITH_BLOCKS = [page for page in PAGES if {"python", "toml", "sh"} & set(languages(page))]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -24,10 +23,30 @@ def test_every_block_says_what_it_is(page: Path) -> None:
     assert [tag for tag in languages(page) if tag not in KNOWN and not tag.startswith("{")] == []
 
 
+def blocks_work(page: Path, directory: Path) -> bool:
+    return run_page(page, directory) == sum(tag in KNOWN[:3] for tag in languages(page))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda page: str(page.relative_to(ROOT)))
 def test_blocks_of_a_page_work(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run_page(page, tmp_path) == sum(tag in KNOWN[:3] for tag in languages(page))
+    assert blocks_work(page, tmp_path)
+
+
+def test_blocks_of_the_readme_work_with_a_plan_that_is_there(
+    hammered: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its problem is built, and its last lines replay and print the plan of an arm, which takes less long."""
+
+    def solved(problem: ImpactProblem, **options: Any) -> Solution:
+        assert isinstance(problem, ImpactProblem)
+        inspect.signature(solve).bind(problem, **options)
+        return hammered
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(impactopt, "solve", solved)
+    assert blocks_work(ROOT / "README.md", tmp_path)
 
 
 # ---------------------------------------------------------------- the checks can fail

@@ -37,8 +37,7 @@ from impactopt.problem import checks
 from impactopt.problem.checks import COLLISIONS, INSTANT
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
-from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective
-from impactopt.problem.objectives.base import check_objectives
+from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
 from impactopt.problem.stances import StancePhase, check_stances, impact_phase, names_of, phase_coordinates
 from impactopt.problem.terms import (

@@ -12,8 +12,7 @@ import numpy as np
 
 from impactopt.contact.fields import in_order
 from impactopt.errors import InputError
-from impactopt.problem.objectives import OBJECTIVES, Objective
-from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
+from impactopt.problem.objectives import OBJECTIVES, PEAK_SCALE, Objective
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.problem.terms.base import kind_of

@@ -57,7 +57,7 @@ def at(place: Array) -> Any:
 # ---- pieces
 
 
-@pytest.mark.parametrize("make", [g1, talos])
+@pytest.mark.parametrize("make", [pytest.param(g1, marks=pytest.mark.slow), talos])
 def test_hulls_are_about_what_pinocchio_reads(make: Callable[[], Robot]) -> None:
     """Between shapes there is never less than between their hulls, but where polygons stand for circles."""
     robot = make()

@@ -180,8 +180,16 @@ def reference(sdc, q, v0, feedforward=None, *, rtol=1e-11, **changes):
 
 
 def make(robot, **options):
-    given = {"step": 2.5e-4, **options}  # of histories, which are summed up here
-    return SDC(robot=robot, striker="right_hand", normal=X, law=LAW, target=TARGET, **given)
+    # histories in steps, as they are summed up here; no second model for the error of freezing
+    given = {"striker": "right_hand", "step": 2.5e-4, "accuracy": None, **options}
+    return SDC(robot=robot, normal=X, law=LAW, target=TARGET, **given)
+
+
+def make_arm(**options):
+    """A collision of a small arm, and its configuration, velocity and torque."""
+    robot = arm()
+    sdc = make(robot, striker="hand", **options)
+    return sdc, robot.posture("start"), np.full(robot.nv, 0.5), 0.1 * robot.torque_limit
 
 
 @pytest.mark.parametrize(
@@ -202,6 +210,7 @@ def test_two_free_masses_in_closed_form(mass, target, stiffness, damping, speed)
         target=FreeMass(mass=target),
         horizon=0.5,
         tolerance=1e-9,
+        accuracy=None,
     )
     result = sdc.collide([0.0], [speed], [0.0])
     impulse, duration = two_masses(mass, target, stiffness, damping, speed)
@@ -472,8 +481,7 @@ def test_histories_hang_together():
 
 
 def test_every_keeps_every_so_many_steps_and_the_last():
-    robot, sdc = robot_named("talos"), default_sdc("talos")
-    q, v, torque = situation(robot, seed=8, speed=1.0)
+    sdc, q, v, torque = make_arm()
     fine = sdc.function(("time", "torque"))(q, v, torque)
     coarse = sdc.function(("time", "torque"), every=16)(q, v, torque)
     for a, b in zip(fine, coarse, strict=True):
@@ -587,21 +595,20 @@ def test_a_contact_that_outlasts_the_horizon_is_said_to():
 
 
 def test_stable_step_is_where_the_method_turns_unstable():
-    robot = robot_named("talos")
-    q, v, torque = situation(robot, seed=14, speed=0.2)
-    kd = np.full(robot.n, 2000.0)
-    longest = make(robot).stable_step(q, kd=kd)
+    sdc, q, v, torque = make_arm()
+    kd = np.full(sdc.robot.n, 2000.0)
+    longest = sdc.stable_step(q, kd=kd)
     free = dataclasses.replace(Effects(), saturation=False)
 
     def final_speed(step):
-        sdc = make(robot, effects=free, step=step, method="rk4", horizon=120 * step)
+        sdc, *_ = make_arm(effects=free, step=step, method="rk4", horizon=120 * step)
         function = sdc.function(("velocity", "separated"), parameters=("kd",))
         return np.abs(np.array(function(q, v, 0 * torque, kd)[0])).max()
 
     assert final_speed(0.95 * longest) < 10.0
     assert final_speed(1.15 * longest) > 1e3
     with pytest.raises(InputError, match="unstable"):
-        make(robot, step=1.05 * longest, method="rk4").collide(q, v, torque, kd=kd)
+        make_arm(step=1.05 * longest, method="rk4")[0].collide(q, v, torque, kd=kd)
 
 
 # ------------------------------------------------------------ bad input

@@ -164,9 +164,10 @@ def test_a_saved_result_is_a_solution_again(folder: SolvedFolder, solution: Solu
 
 def test_a_solution_is_saved_from_python(hammered: Solution, tmp_path: Path) -> None:
     folder = hammered.save(tmp_path / "nail")
-    assert folder == tmp_path / "nail" and load_solution(folder).problem.hash == hammered.problem.hash
-    assert load_solution(folder).trajectory.q == pytest.approx(hammered.trajectory.q, abs=1e-9)
-    loaded = load_solution(folder)  # with the forces between the program's points, where the peak may be
+    loaded = load_solution(folder)
+    assert folder == tmp_path / "nail" and loaded.problem.hash == hammered.problem.hash
+    assert loaded.trajectory.q == pytest.approx(hammered.trajectory.q, abs=1e-9)
+    # with the forces between the program's points, where the peak may be
     assert loaded.collision.time == pytest.approx(hammered.collision.time, abs=1e-12)
     assert loaded.collision.peak_force == pytest.approx(hammered.collision.peak_force, rel=1e-9)
     assert loaded.contact_error_pct == pytest.approx(hammered.contact_error_pct, rel=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import os
 import re
 import signal
@@ -200,9 +201,10 @@ def test_what_is_not_replanned_is_solved(
             raise InputError("the program has other constraints then")
         return dataclasses.replace(arm, result=dataclasses.replace(arm.result, status=Status.TIME_LIMIT))
 
-    def solved(*given: Any, start: Any, **options: Any) -> Solution:
+    def solved(problem: Any, *, start: Any, **options: Any) -> Solution:
+        inspect.signature(solve).bind(problem, start=start, **options)
         starts.append(start)
-        return solve(*given, start=start, **options)
+        return dataclasses.replace(arm, problem=problem)
 
     monkeypatch.setattr(replanning_module, "moved_solution", fails)
     monkeypatch.setattr(replanning_module, "solve", solved)

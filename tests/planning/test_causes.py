@@ -87,6 +87,7 @@ def test_a_scenario_may_be_called_as_a_phase_begins() -> None:
     assert len(told[2]) == 3 and told[0] == told[1] == told[2]
 
 
+@pytest.mark.slow
 def test_no_cause_is_confirmed_by_a_motion_through_an_obstacle(arm: ImpactProblem) -> None:
     """Here another stiffness was named, which is solved without the obstacle."""
     low = [dataclasses.replace(phase, intervals=6) for phase in (arm.swing, arm.follow)]

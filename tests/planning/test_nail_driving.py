@@ -20,9 +20,8 @@ from impactopt import (
     InputError,
     KelvinVoigt,
     Nail,
+    Solution,
     Status,
-    load_problem,
-    solve,
 )
 from impactopt.cli.app import app
 from impactopt.files.problem_file import ProblemFile
@@ -151,12 +150,11 @@ def test_a_nail_that_is_in_on_the_last_step_is_in(monkeypatch: pytest.MonkeyPatc
     assert drive_nail(nailing(), depth=0.01 + 4e-5).done
 
 
-def test_a_blow_has_the_peak_force_of_its_solutions_summary() -> None:
+def test_a_blow_has_the_peak_force_of_its_solutions_summary(hammered: Solution) -> None:
     """That of the finer mesh, as of `impactopt solve`, not that of the program's points."""
-    solution = solve(load_problem("arm_planar"))
-    series = Series(blows=(Blow(solution=solution, depth=0.007),), reason="")
+    series = Series(blows=(Blow(solution=hammered, depth=0.007),), reason="")
     peak = series.describe()["blows"][0]["peak_force_N"]
-    assert peak == solution.summary()["peak_force_N"] != solution.plan.collision.peak_force
+    assert peak == hammered.summary()["peak_force_N"] != hammered.plan.collision.peak_force
 
 
 def test_what_cannot_be_driven_is_refused(solver: Solver) -> None:

@@ -333,8 +333,14 @@ def test_a_result_has_one_answer(name: str, kind: str, tmp_path: Path, punch: So
         assert "trust the plan" in answer(model)["believe"]
 
 
-@pytest.mark.parametrize("kind", ["solve", "strike"])
-@pytest.mark.parametrize("name", ["arm_planar", "chop_arm", pytest.param("punch", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("arm_planar", "solve"),
+        ("chop_arm", "strike"),
+        *(pytest.param("punch", kind, marks=pytest.mark.slow) for kind in ("solve", "strike")),
+    ],
+)
 def test_torques_of_a_plan_are_those_of_full_dynamics(
     name: str, kind: str, request: pytest.FixtureRequest
 ) -> None:

@@ -63,7 +63,7 @@ def chopped(request: pytest.FixtureRequest) -> Solution:
 @pytest.fixture(
     scope="module",
     params=[
-        (KelvinVoigt, 1e8),
+        pytest.param((KelvinVoigt, 1e8), marks=pytest.mark.slow),
         (SpringDamper, 1e7),
         pytest.param((KelvinVoigt, 1e7), marks=pytest.mark.slow),
     ],
@@ -187,7 +187,9 @@ def test_the_model_is_full_where_the_frozen_one_has_no_such_order() -> None:
     assert solution.problem.order == (SEPARATION, "break")
 
 
+@pytest.mark.slow
 def test_a_strike_is_planned_so_too() -> None:
+    """Its contact is a motion's, which the quick tests solve."""
     strike = optimize_strike(stiff())
     assert strike.status is Status.SOLVED
     assert strike.problem.planned_touches == 2

@@ -279,10 +279,10 @@ def test_converged_says_how_well():
 
 
 @pytest.mark.parametrize("engine", [FullDynamics, MujocoDynamics])
-@pytest.mark.parametrize("stiffness", [1e3, 1e9])
+@pytest.mark.parametrize("stiffness", [1e4, 1e9])
 @pytest.mark.parametrize("mass", [1e-4, 1e3])
 def test_closed_form_from_light_to_heavy_from_soft_to_stiff(engine, stiffness, mass):
-    """At the default step, whatever the contact's own time scale is (0.7 us to 0.14 s)."""
+    """At the default step, whatever the contact's own time scale is (0.7 us to 44 ms)."""
     mobility = 1 / 2.0 + 1 / mass
     for ratio in (0.3,) if engine is MujocoDynamics else (0.0, 0.3, 2.0):
         damping = 2 * ratio * np.sqrt(stiffness / mobility)

@@ -195,7 +195,7 @@ def test_switches_cost_no_accuracy(engine: Engine) -> None:
 
 
 @ENGINES
-@pytest.mark.parametrize("mass", [1e-5, 0.1, 1e4])
+@pytest.mark.parametrize("mass", [1e-5, 1e4])
 def test_light_and_heavy_targets_of_steel_are_those_of_an_independent_integration(
     engine: Engine, mass: float
 ) -> None:

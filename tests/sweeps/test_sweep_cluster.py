@@ -10,8 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import dask
-import distributed
 import pyarrow.parquet as pq
 import pytest
 from support.sweep_workers import unlucky
@@ -34,6 +32,9 @@ SWEEP = {
 
 @pytest.fixture(scope="module")
 def client() -> Iterator[Any]:
+    import dask  # by each test that needs it: the quick ones collect this file, too
+    import distributed
+
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 1}),
         distributed.LocalCluster(
@@ -100,6 +101,8 @@ def test_results_that_die_with_their_workers_are_computed_again(
     client: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All workers are killed after they have finished, and before their results are taken."""
+    import distributed
+
     following = distributed.as_completed.__next__
     lost: list[Any] = []
 
@@ -125,6 +128,8 @@ def test_results_that_die_with_their_workers_are_computed_again(
 def test_a_scheduler_that_is_lost_while_it_gives_a_result_is_named(
     client: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    import distributed
+
     def broken(future: Any) -> None:
         raise distributed.comm.CommClosedError("Connection reset by peer")
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import qmc
 from support.fake_solution import strike_record
 
 from impactopt import InputError, holding_torque, planar_arm
@@ -71,6 +70,8 @@ def test_draws_are_in_range_and_of_the_seed(method: str, count: int) -> None:
 
 
 def test_sobol_and_latin_hypercubes_are_spread_better_than_chance() -> None:
+    from scipy.stats import qmc  # takes a quarter of a second, in every process that collects this file
+
     over = {name: Span(first=0.0, last=1.0) for name in "abc"}
 
     def discrepancy(method: str) -> float:

@@ -11,7 +11,12 @@ from impactopt.transcription import structured as scatter_add
 from impactopt.transcription.structured import Runs, count_up, union, with_transposed
 
 seeds = st.integers(0, 2**31)
-scatter_add._library()  # compiled and loaded before Hypothesis times an example
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _loaded() -> None:
+    """Compiled and loaded before Hypothesis times an example."""
+    scatter_add._library()
 
 
 @given(seeds, st.booleans())

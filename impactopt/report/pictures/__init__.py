@@ -1,7 +1,7 @@
 """Pictures of a record: force, ZMP, torque, poses, joint motion, effective mass, iterations, replayed soles.
 
-One picture a file, all in the style of `style.py`. `hierarchy.py`, `compare.py` and `sweep.py` draw several
-collisions, records or cases.
+`histories`, `balance` and `poses` draw one record, all in the style of `style`. `hierarchy`, `compare` and
+`sweep` draw several collisions, records or cases.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from impactopt.errors import InputError, check_choice, check_kind
 from impactopt.files.output import record_of, remove_file, write_file
 from impactopt.files.record import Record
 from impactopt.planning.solution import Solution
-from impactopt.report.pictures.ellipsoid import ellipsoid as ellipsoid
-from impactopt.report.pictures.force import draw_force
-from impactopt.report.pictures.force import force as force
+from impactopt.report.pictures.balance import replay as _replay
+from impactopt.report.pictures.balance import zero_moment_point as zero_moment_point
 from impactopt.report.pictures.hierarchy import hierarchy as hierarchy
-from impactopt.report.pictures.iterations import iterations as iterations
-from impactopt.report.pictures.motion import motion as motion
+from impactopt.report.pictures.histories import draw_force
+from impactopt.report.pictures.histories import force as force
+from impactopt.report.pictures.histories import iterations as iterations
+from impactopt.report.pictures.histories import motion as motion
+from impactopt.report.pictures.histories import torque as torque
 from impactopt.report.pictures.overview import overview as overview
-from impactopt.report.pictures.replay import replay as _replay
-from impactopt.report.pictures.strobe import strobe as strobe
+from impactopt.report.pictures.poses import ellipsoid as ellipsoid
+from impactopt.report.pictures.poses import strobe as strobe
 from impactopt.report.pictures.style import Picture as Picture
 from impactopt.report.pictures.style import RecordPicture, styled
-from impactopt.report.pictures.torque import torque as torque
-from impactopt.report.pictures.zmp import zero_moment_point as zero_moment_point
 
 # by file name without .png
 PICTURES: Mapping[str, RecordPicture] = {

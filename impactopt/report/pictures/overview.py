@@ -7,11 +7,10 @@ from typing import Any
 from matplotlib.figure import FigureBase
 
 from impactopt.files.record import Record
-from impactopt.report.pictures.force import draw_force
-from impactopt.report.pictures.strobe import strobe, strobe_height
+from impactopt.report.pictures.balance import draw_zmp
+from impactopt.report.pictures.histories import draw_force, draw_torque, torque_height
+from impactopt.report.pictures.poses import strobe, strobe_height
 from impactopt.report.pictures.style import picture, title
-from impactopt.report.pictures.torque import draw_torque, torque_height
-from impactopt.report.pictures.zmp import draw_zmp
 
 MIDDLE = 2.6  # [in] of force and ZMP
 

@@ -361,6 +361,13 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
         [_before(END, '<equality><weld name="rod" site1="s1" site2="s2"/></equality>')],
         "closes a loop by the equality 'rod'.*lock it",
     ),
+    "`<weld>` or `<connect>` to a mocap": (
+        [
+            _before("</worldbody>", '<body name="handle" mocap="true"><site name="grip"/></body>'),
+            _before(END, '<equality><connect name="drag" site1="grip" site2="s2"/></equality>'),
+        ],
+        "'drag' to a mocap body is left out",
+    ),
     "`<joint>` in `<equality>`, linear": (
         [_before(END, '<equality><joint joint1="j2" joint2="j1"/></equality>')],
         "",

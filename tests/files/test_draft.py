@@ -1330,7 +1330,11 @@ def test_a_floating_mjcf_that_does_not_stand_is_bolted_and_told(tmp_path: Path) 
     xml.write_text(re.sub(r'(<body name="trunk"[^>]*)>', r'\1 euler="90 0 0"><freejoint/>', xml.read_text()))
     draft = draft_robot(xml, mjcf=True)
     assert draft.fixed and not draft.robot.floating
-    assert not draft_robot(xml, mjcf=True, bolted=True).fixed
+    bolted = draft_robot(xml, mjcf=True, bolted=True)
+    assert not bolted.fixed and not bolted.turn
+    _, quat, _ = draft.turn.split("'")
+    xml.write_text(xml.read_text().replace('euler="90 0 0"', f'quat="{quat}"'))
+    assert len(draft_robot(xml, mjcf=True).legs) == 2
 
 
 @pytest.mark.slow

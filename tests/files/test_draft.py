@@ -666,6 +666,22 @@ def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) ->
 
 
 @pytest.mark.slow
+def test_an_arm_in_a_plane_near_the_ground_strikes(tmp_path: Path) -> None:
+    """Two joints about vertical axes, with links at a height of 10 cm."""
+    box, limits = (0.5, 0.06, 0.04), (-2.5, 2.5)
+    text = urdfs.robot(
+        "planar",
+        urdfs.link("base", 1.0, (0.1, 0.1, 0.04), (0.0, 0.0, 0.02)),
+        urdfs.link("upper", 1.0, box, (0.25, 0.0, 0.0)),
+        urdfs.link("lower", 1.0, box, (0.25, 0.0, 0.05)),
+        urdfs.joint("shoulder", "base", "upper", "0 0 1", (0.0, 0.0, 0.06), limits),
+        urdfs.joint("elbow", "upper", "lower", "0 0 1", (0.5, 0.0, 0.0), limits),
+    )
+    draft = _drafted(tmp_path, text)
+    assert any("the hardest of those tried" in line for line in draft.said)
+
+
+@pytest.mark.slow
 def test_a_weak_blow_is_told_as_such(tmp_path: Path) -> None:
     problem = _problem(tmp_path, urdfs.arm())
     strong = best_share(problem)

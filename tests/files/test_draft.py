@@ -1173,6 +1173,14 @@ def test_the_root_of_a_walker_needs_one(tmp_path: Path) -> None:
         Robot.from_urdf(tmp_path / "robot.urdf")
 
 
+def test_a_walker_in_a_plane_is_refused_for_the_joints_of_its_root(tmp_path: Path) -> None:
+    xml = _walker(tmp_path)
+    planar = '<joint name="x" type="slide" axis="1 0 0"/><joint name="pitch" axis="0 1 0"/>'
+    xml.write_text(re.sub(r'(<body name="trunk"[^>]*>)', rf"\1{planar}", xml.read_text()))
+    with pytest.raises(InputError, match=r"joints x, pitch move its root, .*; replace .*<freejoint/>"):
+        draft_problem(xml, folder=tmp_path, mjcf=True)
+
+
 @pytest.mark.slow
 def test_a_follower_on_an_arm_follows(tmp_path: Path) -> None:
     text = urdfs.following(urdfs.arm(effort=0.0), "elbow", 'joint="shoulder" multiplier="-0.5" offset="0.1"')

@@ -260,7 +260,7 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     "links without mass and shapes": (_between('<link name="between"/>'), ""),
     "links with shapes": (
         _between('<link name="between"><visual><geometry><sphere radius=".1"/></geometry></visual></link>'),
-        "the link 'between' has shapes and mass 0 kg",
+        "the link 'between', moved by '.*', has shapes and mass 0 kg",
     ),
     "`<mimic>`: a follower": (
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j1"/></joint></robot>')],

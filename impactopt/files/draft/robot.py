@@ -238,12 +238,16 @@ def _check_bolted(first: Description, found: Drafted, ties: Sequence[Tie]) -> No
     """InputError for a robot on legs that cannot have a free-flyer.
 
     first : with a free-flyer.  found : without.  ties : that it has with a free-flyer only; if there are
-        none, the root has no mass.
+        none, the root of the floating robot has no mass.
     """
     what, fix = "the root link has no mass", "give it an <inertial>, or bolt it to the ground (--bolted)"
     free = [
         str(name) for name, joint in zip(first.model.names, first.model.joints, strict=True) if joint.nv == 6
     ]
+    if found.mjcf:  # a planar model, as MuJoCo has no moving bodies without mass
+        heavy = next(j for j, body in enumerate(first.model.inertias) if j and body.mass)
+        what = f"joints {', '.join(map(str, list(first.model.names)[2 : heavy + 1]))} move its root"
+        fix = "replace them by a <freejoint/>, or bolt it to the ground (--bolted)"
     if len(free) > 1:
         what, fix = f"joint {free[1]!r} is floating", "remove it and its parent link"
     if ties:

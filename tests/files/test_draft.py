@@ -1374,6 +1374,19 @@ def test_a_draft_keeps_the_limits_that_a_robot_s_manufacturer_publishes(tmp_path
     assert 0.99 < used.max() < 1.001
 
 
+@pytest.mark.slow
+def test_a_drafted_nail_is_driven_as_far_as_from_another_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a drawn posture, with half of the estimate of that which the draft has found, it was a quarter."""
+    monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
+    draft = draft_problem(find_description("panda"), folder=tmp_path, motion="nail", planned=False)
+    (tmp_path / "nail.toml").write_text(draft.text)
+    problem = load_problem(tmp_path / "nail.toml")
+    one, two = (solve(problem, starts=starts).objectives["target energy"] for starts in (1, 2))
+    assert one > 0.95 * two
+
+
 def test_robots_of_example_robot_data_go_by_name() -> None:
     pytest.importorskip("pinocchio")
     try:

@@ -1059,7 +1059,7 @@ def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
     locked = draft_robot(tmp_path / "robot.urdf").locked
     assert {joint for joint, why in locked.items() if why == "drives a base"} == {"steer", "roll"}
     plane = [
-        urdfs.joint("x", "base", "sliding", "1 0 0", (0, 0, 0.2), far, kind="prismatic"),
+        urdfs.joint("x", "base", "sliding", "1 0 0", (0, 0, 0.2), (-10.0, 10.0), kind="prismatic"),
         urdfs.joint("y", "sliding", "turning", "0 1 0", (0, 0, 0), far, kind="prismatic"),
         urdfs.joint("yaw", "turning", "mobile", "0 0 1", (0, 0, 0), far),
     ]

@@ -26,8 +26,8 @@ FINGER_MASS, FINGER_LENGTH = 0.03, 0.25
 # Fractions of the robot's height: largest height of a foot's lowest point above the lowest of all, and least
 # height of the root link's.
 FOOT_HEIGHT, ROOT_HEIGHT = 0.05, 0.1
-# ranges [m] of a prismatic, and [rad] of a revolute joint: larger ones drive a mobile base, the latter if it
-# is on the former
+# ranges [m] of a prismatic, and [rad] of a revolute joint: such ones, or larger, drive a mobile base, the
+# latter if it is on the former
 TRAVEL, TURN = 20.0, 4 * np.pi
 NO_RANGE = "no range"  # reason for which a joint is locked
 TOE = 0.03  # [m] from an ankle to a toe's joint, at least; half of it: largest height of foot over toe
@@ -97,7 +97,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             out[name] = "no mass"
         elif "JointModelP" in joint.shortname() and effort[joint.idx_v] < weight[joint.idx_v]:
             out[name] = "too weak for what it carries"
-        elif "JointModelP" in joint.shortname() and high - low > TRAVEL:
+        elif "JointModelP" in joint.shortname() and high - low >= TRAVEL:
             # what turns such a slide, or turns on it without a limit, steers the base
             steering = [i for i in model.supports[j] if i >= first]
             steering += [i for i in children[j] if np.ptp(range_of(model, i)) > TURN]

@@ -209,7 +209,7 @@ def _idle(model: pin.Model, arms: tuple[Limb, ...]) -> dict[str, str]:
     """
     striking = {arm.tip for arm in arms}
     return {
-        str(model.names[joint]): "moves a head or a sensor"
+        str(model.names[joint]): "in no limb that strikes, as a head"
         for limb in limbs_of(model)
         if limb.tip not in striking
         for joint in limb.own

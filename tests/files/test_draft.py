@@ -1048,6 +1048,14 @@ def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: floa
     assert ("rise" in read_toml(draft.text)["robot"].get("locked_rad", {})) == locked
 
 
+@pytest.mark.parametrize(("damping", "held"), [(1e3, False), (1e7, True)])
+def test_a_joint_that_its_damping_holds_is_locked(tmp_path: Path, damping: float, held: bool) -> None:
+    """As simulators have Gymnasium's Fetch stand still: plans have no friction in the equations of motion."""
+    path = tmp_path / "robot.urdf"
+    path.write_text(urdfs.arm().replace("</joint>", f'<dynamics damping="{damping}"/></joint>', 1))
+    assert (draft_robot(path).locked.get("turn") == "held by its damping") == held
+
+
 def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
     """Fetch's arm was to strike 2.4 m beside it, where no swing of a second takes its base."""
     text = urdfs.arm().replace('<parent link="base"/>', '<parent link="mobile"/>', 1)

@@ -1308,6 +1308,16 @@ def _walker(folder: Path) -> Path:
     return xml
 
 
+def test_a_walker_with_weak_arms_starts_as_they_can_hold_them(tmp_path: Path) -> None:
+    """Bent ahead they needed more than their torque limits."""
+    weak = r'(<joint name="(?:left|right)_(?:shoulder|elbow)\w*".*?effort=")[\d.]+'
+    problem = _problem(tmp_path, re.sub(weak, r"\g<1>1.0", urdfs.biped()))
+    data, q = problem.robot.model.createData(), problem.start_posture
+    load = np.abs(problem.robot.generalized_gravity(data, q)[6:]) / problem.robot.torque_limit
+    arms = [problem.robot.joint_index(f"{side}_shoulder_pitch") for side in ("left", "right")]
+    assert load[arms].max() < TorqueLimit().fraction
+
+
 def test_knees_that_an_equality_fixes_are_named_where_no_posture_is_found(tmp_path: Path) -> None:
     xml, law = _walker(tmp_path), '<joint joint1="{}_knee" polycoef="0.4 0 0 0 0"/>'
     laws = "".join(law.format(side) for side in ("left", "right"))

@@ -781,23 +781,26 @@ def test_where_no_plan_is_found_motions_may_last_longer(
 
 
 @pytest.mark.slow
-def test_a_flange_that_the_wrist_hides_gets_a_peg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("motion", "strikes"), [("punch", MAX_STRIKES), ("nail", 1)])
+def test_a_flange_that_the_wrist_hides_gets_a_peg(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, motion: str, strikes: int
+) -> None:
     """As of some makers' arms: with nothing mounted the link before would touch the target first."""
-    monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
+    monkeypatch.setattr(strong, "MAX_STRIKES", strikes)
     hidden, shown = urdfs.arm(), '<origin xyz="0.0 0.0 0.15"/><geometry><box size="0.08 0.08 0.3"/>'
     at = hidden.index(shown, hidden.index('<link name="elbow_link"'))
     around = '<origin xyz="0.0 0.0 0.235"/><geometry><box size="0.2 0.2 0.47"/>'
     text = hidden[:at] + around + hidden[at + len(shown) :]
     stiff = text.replace('lower="-2.0" upper="2.0"', 'lower="-0.6" upper="0.6"')
     assert stiff != text
-    draft = _drafted(tmp_path, stiff)
+    draft = _drafted(tmp_path, stiff, motion=motion)
     assert "a peg of 5 cm" in "".join(draft.said)
     (peg,) = read_toml(draft.text)["robot"]["tools"]
     (tmp_path / "robot.toml").write_text(draft.text)
     problem = load_problem(tmp_path / "robot.toml")
     assert problem.striker == "peg" and peg["head_m"][2] == pytest.approx(peg["center_m"][2] + 0.025)
     assert optimize_strike(problem).status.usable
-    assert "peg" not in _drafted(tmp_path, urdfs.arm()).text
+    assert "peg" not in _drafted(tmp_path, urdfs.arm(), motion=motion).text
 
 
 def test_links_without_mass_are_told(tmp_path: Path) -> None:

@@ -223,7 +223,7 @@ def _bolted(
     q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
     targets = hits(motion, robot)
     strong, hit, edgewise, why = _hardest(robot, arms[0], q, targets)
-    pegged = not strong and motion not in FROM_ABOVE
+    pegged = not strong
     if pegged:  # the striking point may be behind the links: try again with one ahead of it
         other, with_peg = robot.with_tool(_peg(robot, arms[0])), replace(arms[0], name="peg")
         strong, hit, edgewise, _ = _hardest(other, with_peg, q, targets)

@@ -38,6 +38,7 @@ def unit_doubts(robot: Robot) -> Iterator[str]:
     """Messages about lengths, angles and inertias that are plausible in other units only."""
     yield from _giant(robot)
     yield from _in_degrees(robot)
+    yield from _in_radians(robot)
     yield from _light_links(robot)
 
 
@@ -80,6 +81,17 @@ def _in_degrees(robot: Robot) -> Iterator[str]:
         yield (
             f"position limits of {_counted(names)}: {robot.lower[k]:.4g} to {robot.upper[k]:.4g} rad are "
             "hard to believe: are they in degrees? Give them in radians"
+        )
+
+
+def _in_radians(robot: Robot) -> Iterator[str]:
+    """Message about an MJCF whose limits of angles are all smaller than a turn, had they been in radians."""
+    turning = ~robot.prismatic & np.isfinite(robot.lower) & np.isfinite(robot.upper)
+    widest = float(np.abs([robot.lower, robot.upper])[:, turning].max(initial=0.0))
+    if robot.mjcf is not None and turning.sum() > 1 and 0 < widest < np.radians(2 * np.pi):
+        yield (
+            f"position limits of all joints are within {widest:.2g} rad ({np.degrees(widest):.2g} degrees), "
+            'hard to believe: are angles of the file in radians? Give it <compiler angle="radian"/>'
         )
 
 

@@ -115,6 +115,9 @@ def notes_of(c: Compiled, gravcomp: Compensation, torque: Mapping[str, float]) -
             yield f"{own} of the free joint {c.name('joint', j)!r}: left out"
     if getattr(mj, "nflex", 0):
         yield "deformable bodies (flex) are left out"
+    if not c.off("equality", "constraint"):
+        for e in (e for e in range(mj.neq) if mj.eq_active0[e] and _by_mocap(c, e)):
+            yield f"the equality {c.name('equality', e)!r} to a mocap body is left out: motors move the robot"
     plugged = [c.name("body", b) for b in c.body if c.numbers("body_plugin")[b : b + 1].max(initial=-1) >= 0]
     if plugged:
         yield f"plugins of {', '.join(plugged)} are left out"
@@ -173,7 +176,7 @@ def _equalities(c: Compiled) -> Iterator[Tie]:
     for e in range(mj.neq):
         kind, one, other = int(mj.eq_type[e]), int(mj.eq_obj1id[e]), int(mj.eq_obj2id[e])
         name = c.name("equality", e)
-        if not mj.eq_active0[e]:
+        if not mj.eq_active0[e] or _by_mocap(c, e):
             continue
         if kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
             yield from _loop(c, name, *(_body(c, e, i) for i in (one, other)))
@@ -197,6 +200,16 @@ def _body(c: Compiled, equality: int, i: int) -> int:
     kinds = c.numbers("eq_objtype")  # MuJoCo 3.2 has no sites there
     is_site = bool(kinds.size) and kinds[equality] == int(c.mujoco.mjtObj.mjOBJ_SITE)
     return int(c.mj.site_bodyid[i]) if is_site else max(i, 0)
+
+
+def _by_mocap(c: Compiled, equality: int) -> bool:
+    """True if a <connect> or <weld> ties the robot to a mocap body, by which a simulation drags it."""
+    mj, kinds = c.mj, c.mujoco.mjtEq
+    if int(mj.eq_type[equality]) not in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
+        return False
+    bodies = [_body(c, equality, int(i)) for i in (mj.eq_obj1id[equality], mj.eq_obj2id[equality])]
+    dragged = any(b and b in c.body for b in bodies)
+    return dragged and any(b not in c.body and mj.body_mocapid[mj.body_rootid[b]] >= 0 for b in bodies)
 
 
 def _loop(c: Compiled, name: str, one: int, other: int) -> Iterator[Tie]:
@@ -398,8 +411,6 @@ class _Reader(Compiled):
         if len(self.roots) > 1 and floating:
             raise InputError(f"{what} has several bodies with joints on the ground: it cannot float")
         self.floating = bool(free) if floating is None else floating
-        # Followers by joint equalities need one coordinate even without limits, not Pinocchio's (cos, sin) of
-        # continuous joints.
         joints = (mj.eq_type == self.mujoco.mjtEq.mjEQ_JOINT) & (mj.eq_obj2id >= 0)
         self.followers = set(map(int, mj.eq_obj1id[joints]))
         self.model.name = mj.names[: mj.names.index(b"\0")].decode() or "robot"
@@ -510,7 +521,9 @@ class _Reader(Compiled):
             pin.SE3(pin.exp3(-zero * axis), np.zeros(3)) if hinge else pin.SE3(np.eye(3), -zero * axis)
         )
         limited, dof = bool(mj.jnt_limited[j]), int(mj.jnt_dofadr[j])
-        kind, turn = _kind(axis, hinge, limited or j in self.followers)
+        stiffness = 0.0 if self.off("spring", "passive") else _first(mj.jnt_stiffness[j])
+        # one coordinate, which counts turns, not Pinocchio's (cos, sin) of continuous joints
+        kind, turn = _kind(axis, hinge, limited or bool(stiffness) or j in self.followers)
         added = int(model.addJoint(parent, kind, place * turn, name))
         at = model.joints[added]
         low, high = mj.jnt_range[j] if limited else (-np.inf, np.inf)
@@ -525,8 +538,7 @@ class _Reader(Compiled):
             viscous=0.0 if self.off("damper", "passive") else _first(mj.dof_damping[dof]),
             dry=0.0 if self.off("frictionloss", "constraint") else mj.dof_frictionloss[dof],
         )
-        stiffness = _first(mj.jnt_stiffness[j])
-        if stiffness and not self.off("spring", "passive"):
+        if stiffness:
             self.out.springs[name] = stiffness, float(mj.qpos_spring[mj.jnt_qposadr[j]])
         return added, int(model.addJointFrame(added, above)), turn
 

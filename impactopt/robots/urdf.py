@@ -174,9 +174,10 @@ def _hollow(root: Element, model: pin.Model) -> Iterator[Tie]:
         joint = frame.parentJoint
         massless = model.joints[joint].nv == 1 and not model.inertias[joint].mass
         if massless and frame.type == pin.FrameType.BODY and str(frame.name) in shaped:
+            moving = str(model.names[joint])
             yield Tie(
-                text=f"the link {frame.name!r} has shapes and mass 0 kg",
-                joints=(str(model.names[joint]),),
+                text=f"the link {frame.name!r}, moved by {moving!r}, has shapes and mass 0 kg",
+                joints=(moving,),
                 free=0,
                 fix="give its <inertial> a mass > 0",
             )

@@ -675,6 +675,22 @@ def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) ->
 
 
 @pytest.mark.slow
+def test_an_arm_in_a_plane_near_the_ground_strikes(tmp_path: Path) -> None:
+    """Two joints about vertical axes, with links at a height of 10 cm."""
+    box, limits = (0.5, 0.06, 0.04), (-2.5, 2.5)
+    text = urdfs.robot(
+        "planar",
+        urdfs.link("base", 1.0, (0.1, 0.1, 0.04), (0.0, 0.0, 0.02)),
+        urdfs.link("upper", 1.0, box, (0.25, 0.0, 0.0)),
+        urdfs.link("lower", 1.0, box, (0.25, 0.0, 0.05)),
+        urdfs.joint("shoulder", "base", "upper", "0 0 1", (0.0, 0.0, 0.06), limits),
+        urdfs.joint("elbow", "upper", "lower", "0 0 1", (0.5, 0.0, 0.0), limits),
+    )
+    draft = _drafted(tmp_path, text)
+    assert any("the hardest of those tried" in line for line in draft.said)
+
+
+@pytest.mark.slow
 def test_a_weak_blow_is_told_as_such(tmp_path: Path) -> None:
     problem = _problem(tmp_path, urdfs.arm())
     strong = best_share(problem)
@@ -774,23 +790,26 @@ def test_where_no_plan_is_found_motions_may_last_longer(
 
 
 @pytest.mark.slow
-def test_a_flange_that_the_wrist_hides_gets_a_peg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("motion", "strikes"), [("punch", MAX_STRIKES), ("nail", 2)])
+def test_a_flange_that_the_wrist_hides_gets_a_peg(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, motion: str, strikes: int
+) -> None:
     """As of some makers' arms: with nothing mounted the link before would touch the target first."""
-    monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
+    monkeypatch.setattr(strong, "MAX_STRIKES", strikes)
     hidden, shown = urdfs.arm(), '<origin xyz="0.0 0.0 0.15"/><geometry><box size="0.08 0.08 0.3"/>'
     at = hidden.index(shown, hidden.index('<link name="elbow_link"'))
     around = '<origin xyz="0.0 0.0 0.235"/><geometry><box size="0.2 0.2 0.47"/>'
     text = hidden[:at] + around + hidden[at + len(shown) :]
     stiff = text.replace('lower="-2.0" upper="2.0"', 'lower="-0.6" upper="0.6"')
     assert stiff != text
-    draft = _drafted(tmp_path, stiff)
+    draft = _drafted(tmp_path, stiff, motion=motion)
     assert "a peg of 5 cm" in "".join(draft.said)
     (peg,) = read_toml(draft.text)["robot"]["tools"]
     (tmp_path / "robot.toml").write_text(draft.text)
     problem = load_problem(tmp_path / "robot.toml")
     assert problem.striker == "peg" and peg["head_m"][2] == pytest.approx(peg["center_m"][2] + 0.025)
     assert optimize_strike(problem).status.usable
-    assert "peg" not in _drafted(tmp_path, urdfs.arm()).text
+    assert "peg" not in _drafted(tmp_path, urdfs.arm(), motion=motion).text
 
 
 def test_links_without_mass_are_told(tmp_path: Path) -> None:
@@ -1041,6 +1060,14 @@ def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: floa
     assert ("rise" in read_toml(draft.text)["robot"].get("locked_rad", {})) == locked
 
 
+@pytest.mark.parametrize(("damping", "held"), [(1e3, False), (1e7, True)])
+def test_a_joint_that_its_damping_holds_is_locked(tmp_path: Path, damping: float, held: bool) -> None:
+    """As simulators have Gymnasium's Fetch stand still: plans have no friction in the equations of motion."""
+    path = tmp_path / "robot.urdf"
+    path.write_text(urdfs.arm().replace("</joint>", f'<dynamics damping="{damping}"/></joint>', 1))
+    assert (draft_robot(path).locked.get("turn") == "held by its damping") == held
+
+
 def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
     """Fetch's arm was to strike 2.4 m beside it, where no swing of a second takes its base."""
     text = urdfs.arm().replace('<parent link="base"/>', '<parent link="mobile"/>', 1)
@@ -1052,7 +1079,7 @@ def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
     locked = draft_robot(tmp_path / "robot.urdf").locked
     assert {joint for joint, why in locked.items() if why == "drives a base"} == {"steer", "roll"}
     plane = [
-        urdfs.joint("x", "base", "sliding", "1 0 0", (0, 0, 0.2), far, kind="prismatic"),
+        urdfs.joint("x", "base", "sliding", "1 0 0", (0, 0, 0.2), (-10.0, 10.0), kind="prismatic"),
         urdfs.joint("y", "sliding", "turning", "0 1 0", (0, 0, 0), far, kind="prismatic"),
         urdfs.joint("yaw", "turning", "mobile", "0 0 1", (0, 0, 0), far),
     ]
@@ -1164,6 +1191,14 @@ def test_the_root_of_a_walker_needs_one(tmp_path: Path) -> None:
     assert not draft_robot(tmp_path / "robot.urdf", bolted=True).robot.floating
     with pytest.raises(InputError, match=r"the root link 'trunk' .*mass 0 kg.*floating = false"):
         Robot.from_urdf(tmp_path / "robot.urdf")
+
+
+def test_a_walker_in_a_plane_is_refused_for_the_joints_of_its_root(tmp_path: Path) -> None:
+    xml = _walker(tmp_path)
+    planar = '<joint name="x" type="slide" axis="1 0 0"/><joint name="pitch" axis="0 1 0"/>'
+    xml.write_text(re.sub(r'(<body name="trunk"[^>]*>)', rf"\1{planar}", xml.read_text()))
+    with pytest.raises(InputError, match=r"joints x, pitch move its root, .*; replace .*<freejoint/>"):
+        draft_problem(xml, folder=tmp_path, mjcf=True)
 
 
 @pytest.mark.slow
@@ -1285,6 +1320,16 @@ def _walker(folder: Path) -> Path:
     return xml
 
 
+def test_a_walker_with_weak_arms_starts_as_they_can_hold_them(tmp_path: Path) -> None:
+    """Bent ahead they needed more than their torque limits."""
+    weak = r'(<joint name="(?:left|right)_(?:shoulder|elbow)\w*".*?effort=")[\d.]+'
+    problem = _problem(tmp_path, re.sub(weak, r"\g<1>1.0", urdfs.biped()))
+    data, q = problem.robot.model.createData(), problem.start_posture
+    load = np.abs(problem.robot.generalized_gravity(data, q)[6:]) / problem.robot.torque_limit
+    arms = [problem.robot.joint_index(f"{side}_shoulder_pitch") for side in ("left", "right")]
+    assert load[arms].max() < TorqueLimit().fraction
+
+
 def test_knees_that_an_equality_fixes_are_named_where_no_posture_is_found(tmp_path: Path) -> None:
     xml, law = _walker(tmp_path), '<joint joint1="{}_knee" polycoef="0.4 0 0 0 0"/>'
     laws = "".join(law.format(side) for side in ("left", "right"))
@@ -1339,7 +1384,11 @@ def test_a_floating_mjcf_that_does_not_stand_is_bolted_and_told(tmp_path: Path) 
     xml.write_text(re.sub(r'(<body name="trunk"[^>]*)>', r'\1 euler="90 0 0"><freejoint/>', xml.read_text()))
     draft = draft_robot(xml, mjcf=True)
     assert draft.fixed and not draft.robot.floating
-    assert not draft_robot(xml, mjcf=True, bolted=True).fixed
+    bolted = draft_robot(xml, mjcf=True, bolted=True)
+    assert not bolted.fixed and not bolted.turn
+    _, quat, _ = draft.turn.split("'")
+    xml.write_text(xml.read_text().replace('euler="90 0 0"', f'quat="{quat}"'))
+    assert len(draft_robot(xml, mjcf=True).legs) == 2
 
 
 @pytest.mark.slow
@@ -1353,6 +1402,19 @@ def test_a_draft_keeps_the_limits_that_a_robot_s_manufacturer_publishes(tmp_path
     away = plan.trajectory.phase != 1  # in contact the reference coasts
     used = np.abs(plan.trajectory.a[away]).max(axis=0) / limit
     assert 0.99 < used.max() < 1.001
+
+
+@pytest.mark.slow
+def test_a_drafted_nail_is_driven_as_far_as_from_another_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a drawn posture, with half of the estimate of that which the draft has found, it was a quarter."""
+    monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
+    draft = draft_problem(find_description("panda"), folder=tmp_path, motion="nail", planned=False)
+    (tmp_path / "nail.toml").write_text(draft.text)
+    problem = load_problem(tmp_path / "nail.toml")
+    one, two = (solve(problem, starts=starts).objectives["target energy"] for starts in (1, 2))
+    assert one > 0.95 * two
 
 
 def test_robots_of_example_robot_data_go_by_name() -> None:

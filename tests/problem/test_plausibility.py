@@ -64,6 +64,19 @@ def test_limits_in_degrees_are_doubted() -> None:
     assert told[0].startswith("position limits of shoulder and 2 more joints: -2.6 to 149 rad are hard to")
 
 
+@pytest.mark.parametrize(("angle", "told"), [("radian", 0), ("degree", 1)])
+def test_angles_of_an_mjcf_in_radians_are_doubted_without_its_saying_so(
+    tmp_path: Path, angle: str, told: int
+) -> None:
+    pytest.importorskip("mujoco")
+    body = '<body name="{0}" pos="0 0 .3"><joint name="{0}" axis="0 1 0" range="-2.1 2.1"/><geom size=".1"/>'
+    links = body.format("upper") + body.format("lower") + "</body></body>"
+    path = tmp_path / "arm.xml"
+    path.write_text(f'<mujoco><compiler angle="{angle}"/><worldbody>{links}</worldbody></mujoco>')
+    robot = Robot.from_mjcf(path, torque_limit=50.0, velocity_limit=4.0)
+    assert sum("are angles of the file in radians?" in text for text in doubts(robot)) == told
+
+
 def test_the_inertia_of_a_body_lighter_than_foam_is_doubted() -> None:
     robot = planar_arm()
     model = robot.model.copy()

@@ -260,7 +260,7 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     "links without mass and shapes": (_between('<link name="between"/>'), ""),
     "links with shapes": (
         _between('<link name="between"><visual><geometry><sphere radius=".1"/></geometry></visual></link>'),
-        "the link 'between' has shapes and mass 0 kg",
+        "the link 'between', moved by '.*', has shapes and mass 0 kg",
     ),
     "`<mimic>`: a follower": (
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j1"/></joint></robot>')],
@@ -360,6 +360,13 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
     "`<connect>`": (
         [_before(END, '<equality><weld name="rod" site1="s1" site2="s2"/></equality>')],
         "closes a loop by the equality 'rod'.*lock it",
+    ),
+    "`<weld>` or `<connect>` to a mocap": (
+        [
+            _before("</worldbody>", '<body name="handle" mocap="true"><site name="grip"/></body>'),
+            _before(END, '<equality><connect name="drag" site1="grip" site2="s2"/></equality>'),
+        ],
+        "'drag' to a mocap body is left out",
     ),
     "`<joint>` in `<equality>`, linear": (
         [_before(END, '<equality><joint joint1="j2" joint2="j1"/></equality>')],

@@ -391,6 +391,21 @@ def test_what_is_no_robot_here_is_refused(tree: Path, old: str, new: str, said: 
         Robot.from_mjcf(tree, **LACKS)
 
 
+def test_a_spring_of_a_continuous_joint_counts_its_turns(tree: Path) -> None:
+    turn = 'name="turn" axis="0 -1 1" limited="false"'
+    tree.write_text(TREE.replace(turn, f'{turn} stiffness="3" springref="40"'))
+    robot = Robot.from_mjcf(tree, **LACKS)
+    assert np.isinf(robot.lower[robot.joint_names.index("turn")])
+    mj, angle = mujoco.MjModel.from_xml_path(str(tree)), 9.0  # more than a turn from the spring's rest
+    there, joint = mujoco.MjData(mj), mj.joint("turn")
+    there.qpos[joint.qposadr] = angle
+    mujoco.mj_forward(mj, there)
+    q = pin.neutral(robot.model)
+    q[robot.model.joints[robot.model.getJointId("turn")].idx_q] = angle
+    found = robot.spring_torque(q)[robot.joint_names.index("turn")]
+    assert found == pytest.approx(-there.qfrc_spring[joint.dofadr[0]], rel=1e-12)
+
+
 def test_missing_limits_are_mended_in_the_files_own_words(tree: Path) -> None:
     with pytest.raises(InputError) as found:
         Robot.from_mjcf(tree, torque_limit={"lift": 100.0})

@@ -68,6 +68,7 @@ PEGGED = (
     f"a peg of {100 * PEG:g} cm is drafted on the striking link, as the links before it would touch the "
     "target first: mount one, or give your own tool in [[robot.tools]]"
 )
+TURNED = "two limbs would be legs if the root were turned {}: if the robot is to stand, turn it in the file"
 BALL = 0.22  # [m] largest diameter
 KICKS = (0.3, 0.2, 0.4)  # distances of the ball ahead over the hip's height, in the order tried
 
@@ -116,6 +117,8 @@ def draft_problem(
         for why, what in ((NO_RANGE, "without a range"), (FIXED, FIXED)):
             if names := sorted(joint for joint, reason in drafted.locked.items() if reason == why):
                 causes.append(f"joints {what}, locked: {', '.join(names)}")
+        if drafted.turn:
+            causes.append(TURNED.format(drafted.turn))
         if not causes:
             raise
         raise InputError("; ".join([*causes, str(error)])) from error
@@ -220,7 +223,7 @@ def _bolted(
     q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
     targets = hits(motion, robot)
     strong, hit, edgewise, why = _hardest(robot, arms[0], q, targets)
-    pegged = not strong and motion not in FROM_ABOVE
+    pegged = not strong
     if pegged:  # the striking point may be behind the links: try again with one ahead of it
         other, with_peg = robot.with_tool(_peg(robot, arms[0])), replace(arms[0], name="peg")
         strong, hit, edgewise, _ = _hardest(other, with_peg, q, targets)
@@ -656,6 +659,8 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
             "the MJCF's free joint is taken out: no two legs are found below its root, z up, with all joints "
             "at zero"
         )
+    if drafted.turn:
+        yield TURNED.format(drafted.turn)
     across = [sole["name"] for sole in data["robot"].get("soles", ()) if _wide(sole["polygon_m"])]
     if across:
         yield f"soles that are longer across than ahead: {', '.join(across)}; look at the feet's shapes"

@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece
-from impactopt.robots.build import effort_limit, is_floating, neutral
+from impactopt.robots.build import effort_limit, friction, is_floating, neutral
 from impactopt.robots.checks import LEG
 
 Array = NDArray[np.float64]
@@ -26,9 +26,10 @@ FINGER_MASS, FINGER_LENGTH = 0.03, 0.25
 # Fractions of the robot's height: largest height of a foot's lowest point above the lowest of all, and least
 # height of the root link's.
 FOOT_HEIGHT, ROOT_HEIGHT = 0.05, 0.1
-# ranges [m] of a prismatic, and [rad] of a revolute joint: larger ones drive a mobile base, the latter if it
-# is on the former
+# ranges [m] of a prismatic, and [rad] of a revolute joint: such ones, or larger, drive a mobile base, the
+# latter if it is on the former
 TRAVEL, TURN = 20.0, 4 * np.pi
+CREEP = 1e-3  # [m/s], [rad/s] at which the damping of a joint that is held exceeds the robot's weight, at 1 m
 NO_RANGE = "no range"  # reason for which a joint is locked
 TOE = 0.03  # [m] from an ankle to a toe's joint, at least; half of it: largest height of foot over toe
 
@@ -72,7 +73,7 @@ def range_of(model: pin.Model, j: int) -> tuple[float, float]:
 
 def to_lock(model: pin.Model) -> dict[str, str]:
     """Joints that a plan should not move, with reasons: fingers, wheels, joints without range or mass,
-    prismatic joints too weak for their load, drives of a mobile base.
+    prismatic joints too weak for their load, drives of a mobile base, joints held by their damping.
     """
     children, out = _children(model), dict[str, str]()
     first = 2 if is_floating(model) else 1
@@ -82,6 +83,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
     mass, total = list(data.mass), sum(float(body.mass) for body in model.inertias)
     reach = _reach(model, children)
     effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
+    viscous = friction(model)[0]
     weight = np.abs(pin.computeGeneralizedGravity(model, data, neutral(model)))
     for j in range(model.njoints - 1, first - 1, -1):
         joint, name, (low, high) = model.joints[j], str(model.names[j]), range_of(model, j)
@@ -97,11 +99,13 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             out[name] = "no mass"
         elif "JointModelP" in joint.shortname() and effort[joint.idx_v] < weight[joint.idx_v]:
             out[name] = "too weak for what it carries"
-        elif "JointModelP" in joint.shortname() and high - low > TRAVEL:
+        elif "JointModelP" in joint.shortname() and high - low >= TRAVEL:
             # what turns such a slide, or turns on it without a limit, steers the base
             steering = [i for i in model.supports[j] if i >= first]
             steering += [i for i in children[j] if np.ptp(range_of(model, i)) > TURN]
             out |= {str(model.names[i]): "drives a base" for i in steering}
+        elif joint.nv == 1 and CREEP * viscous[joint.idx_v] > 9.81 * total:
+            out[name] = "held by its damping"
     for j in range(first, model.njoints):  # a hand: several short and light chains on one link
         small = [c for c in children[j] if mass[c] < FINGER_MASS * total and reach[c] < FINGER_LENGTH]
         if len(small) > 1 and len(small) == len(children[j]):

@@ -26,6 +26,8 @@ STARTS = 10  # random initial guesses
 # distances of the soles tried, over that in the zero posture: with splayed legs they may not be level
 WIDTHS = (1.0, 0.9, 0.8)
 GRAVITY_SHARE = 0.5  # largest gravity torque of an ankle or of an idle arm's joint, over its limit
+HELD_SHARE = 0.75  # the same of a bent arm's joint, if that is possible: plans have 0.85
+LOAD_COST = 0.1  # [m]: position error that costs as much as a gravity torque of the whole limit beyond that
 MARGIN = 0.1  # of a joint's range, to both limits together
 RANGE_COST = 0.02  # [m]: position error that costs as much as a deviation by a joint's whole range
 UPPER_ARM = 0.2  # least length of an upper arm, over the arm's
@@ -131,7 +133,9 @@ def bend_arm(
         pin.updateFramePlacement(model, data, fid)
         gap = target - data.oMf[fid].translation
         points = data.oMi[arm.tip].rotation @ axis
-        return np.concatenate([gap, 0.02 * (points - way), RANGE_COST * (angles - middle) / span])
+        preferred = RANGE_COST * (angles - middle) / span
+        heavy = np.maximum(_gravity_share(robot, data, now, own) - HELD_SHARE, 0.0)
+        return np.concatenate([gap, 0.02 * (points - way), preferred, LOAD_COST * heavy])
 
     for k in range(STARTS):
         start = np.clip(middle + (0.25 * span * rng.standard_normal(len(own)) if k else 0.05), low, high)
@@ -285,8 +289,7 @@ def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
     rest, rng = robot.joint_positions(q)[own], np.random.default_rng(0)
 
     def errors(angles: Array) -> Array:
-        gravity = robot.generalized_gravity(data, _set(robot, q, own, angles))
-        share = np.abs(gravity[robot.nv - robot.n + own]) / robot.torque_limit[own]
+        share = _gravity_share(robot, data, _set(robot, q, own, angles), own)
         return np.concatenate(
             [np.maximum(share - GRAVITY_SHARE, 0.0), RANGE_COST * (angles - rest) / (high - low)]
         )
@@ -300,6 +303,12 @@ def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
         posture = _set(robot, q, own, found.x)
         tries.append((len(bodies_of(robot).piece_pairs(posture)[1]), float(found.cost), posture))
     return min(tries, key=lambda one: one[:2])[2]
+
+
+def _gravity_share(robot: Robot, data: pin.Data, q: Array, own: NDArray[np.intp]) -> Array:
+    """Gravity torques of joints at q (nq,) over their torque limits."""
+    gravity = robot.generalized_gravity(data, q)
+    return np.asarray(np.abs(gravity[robot.nv - robot.n + own]) / robot.torque_limit[own])
 
 
 def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:

@@ -16,7 +16,7 @@ from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.draft.default_drives import RANGE, Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, limbs_of, range_of, to_lock, toes, unshared
-from impactopt.robots.build import is_floating, lock_joints
+from impactopt.robots.build import ROOT, is_floating, lock_joints, neutral
 from impactopt.robots.checks import LEG, REPAIRED, check_inertias
 from impactopt.robots.couplings import unfit
 from impactopt.robots.description import Description, Tie
@@ -40,6 +40,7 @@ class Drafted:
     wrong : messages about non-physical inertias, which are repaired here.
     pieces : convex hulls of the links, by the joint that moves them.
     fixed : True if its MJCF has a free joint, but no legs to stand on.
+    turn : the turn of the root, in words, with which it would have legs; "" if there is none.
     """
 
     robot: Robot
@@ -52,6 +53,7 @@ class Drafted:
     arms: tuple[Limb, ...]
     pieces: Mapping[int, tuple[Piece, ...]] = field(repr=False)
     fixed: bool = False
+    turn: str = ""
 
     @property
     def mjcf(self) -> bool:
@@ -140,7 +142,8 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
         if extra or carrying & found.drives.torque.keys():
             found = _made(path, mjcf, True, locked, carrying)
             legs = legs_of(found.robot.model, found.pieces)
-    elif floats:
+    turn = "" if legs or not floats else _turn(found)
+    if floats and not legs:
         found = _made(path, mjcf, False, locked)
     arms = arms_of(found.robot.model, legs)
     if idle := {} if legs else _idle(found.robot.model, arms):
@@ -149,7 +152,27 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if not arms and not legs:
         raise InputError(f"{path}: there is no limb to strike with")
     fixed = mjcf and not legs and not bolted and is_floating(read_mjcf(path).model)
-    return replace(found, legs=legs, arms=arms, fixed=fixed)
+    return replace(found, legs=legs, arms=arms, fixed=fixed, turn=turn)
+
+
+def _turn(found: Drafted) -> str:
+    """The turn of a floating robot's root with which two of its limbs, but not all, would be legs.
+
+    Files of simulators with y up are read as robots that lie on their side.
+    """
+    for axis, degrees in (("x", 90), ("x", -90), ("y", 90), ("y", -90), ("x", 180)):
+        model = found.robot.model.copy()
+        q = neutral(model)
+        now = pin.Quaternion(*q[[6, 3, 4, 5]])
+        q[3:7] = pin.Quaternion(pin.utils.rotate(axis, np.radians(degrees)) @ now.matrix()).coeffs()
+        model.referenceConfigurations[ROOT] = q
+        legs = legs_of(model, found.pieces)
+        enough = len(legs) == 2 and min(map(len, unshared(model, legs))) >= LEG - 1
+        if enough and any(len(arm.own) > 1 for arm in arms_of(model, legs)):
+            quat = " ".join(f"{part:.7g}" for part in q[[6, 3, 4, 5]] + 0.0)
+            how = f", by quat='{quat}' of its <body>" if found.mjcf else ""
+            return f"by {degrees} degrees about {axis}{how}"
+    return ""
 
 
 def _coupled_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
@@ -186,7 +209,7 @@ def _idle(model: pin.Model, arms: tuple[Limb, ...]) -> dict[str, str]:
     """
     striking = {arm.tip for arm in arms}
     return {
-        str(model.names[joint]): "moves a head or a sensor"
+        str(model.names[joint]): "in no limb that strikes, as a head"
         for limb in limbs_of(model)
         if limb.tip not in striking
         for joint in limb.own
@@ -215,12 +238,16 @@ def _check_bolted(first: Description, found: Drafted, ties: Sequence[Tie]) -> No
     """InputError for a robot on legs that cannot have a free-flyer.
 
     first : with a free-flyer.  found : without.  ties : that it has with a free-flyer only; if there are
-        none, the root has no mass.
+        none, the root of the floating robot has no mass.
     """
     what, fix = "the root link has no mass", "give it an <inertial>, or bolt it to the ground (--bolted)"
     free = [
         str(name) for name, joint in zip(first.model.names, first.model.joints, strict=True) if joint.nv == 6
     ]
+    if found.mjcf:  # a planar model, as MuJoCo has no moving bodies without mass
+        heavy = next(j for j, body in enumerate(first.model.inertias) if j and body.mass)
+        what = f"joints {', '.join(map(str, list(first.model.names)[2 : heavy + 1]))} move its root"
+        fix = "replace them by a <freejoint/>, or bolt it to the ground (--bolted)"
     if len(free) > 1:
         what, fix = f"joint {free[1]!r} is floating", "remove it and its parent link"
     if ties:

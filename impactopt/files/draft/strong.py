@@ -38,6 +38,7 @@ TRAVEL_FACTORS = (1.0, 0.75, 0.55, 0.4)  # on the travel, tried while joint limi
 BEHIND = 0.06, 0.15
 SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # durations [s] for fast robots
 DURATION_FACTORS = (0.8, 3.0)  # shortest and longest duration over the time at the velocity limits
+LEVEL = 1e-3  # [m] tolerance of heights, to which hit points are rounded
 AFTER = 0.6  # [s] in which a target that flies away may not meet the base
 AFTER_STEP = 0.03  # [m] of its travel between two tests
 ITERATIONS, SECONDS = 300, 30.0  # limits of a trial strike or plan: most need a sixth of that
@@ -120,7 +121,8 @@ def _candidates(
 
     clipped : joints with less range than their run-up begin at its end, as those of telescopes.
     """
-    impacts = [impact for impact in impacts if impact.point[2] > LOWEST / 2]
+    highest = max((float(impact.point[2]) for impact in impacts), default=0.0)
+    impacts = [impact for impact in impacts if impact.point[2] > _floor(highest)]
     reach = max((float(np.linalg.norm(impact.point)) for impact in impacts), default=0.0)
     taken: list[EstimatedImpact] = []
     for impact in impacts[:MAX_CANDIDATES]:
@@ -135,6 +137,11 @@ def _candidates(
         yield problem, impact
         if len(taken) == MAX_STRIKES:
             return
+
+
+def _floor(height: float) -> float:
+    """Least height [m] of a striking point that has to reach a height: an arm may move in a low plane."""
+    return min(LOWEST / 2, height) - LEVEL
 
 
 def strike_problem(
@@ -153,6 +160,7 @@ def strike_problem(
     `ImpactProblem`.  clipped : joints with less range than their run-up begin at its end.
     """
     point = rounded_point(robot, striker, impact.point)
+    floor = _floor(float(impact.point[2]))
     size = float(np.abs(impact.v).max())
     way = impact.v / size * float(np.clip(RUN_UP * size, *TRAVEL))
     for factor in TRAVEL_FACTORS:
@@ -163,7 +171,7 @@ def strike_problem(
         start = np.array(pin.integrate(robot.model, start, within - angles)) if clipped else start
         inside = clipped or np.array_equal(angles, within)
         at = striking_point(robot, striker, start)
-        if not inside or impact.normal @ (point - at) < behind or at[2] < LOWEST / 2:
+        if not inside or impact.normal @ (point - at) < behind or at[2] < floor:
             continue
         try:
             problem = ImpactProblem(

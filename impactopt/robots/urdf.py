@@ -98,20 +98,14 @@ def parse_urdf(urdf: str) -> Element:
 
 
 def _check_joints(root: Element, urdf: str) -> None:
-    """InputError with all joints that lack a limit of effort or velocity, or close a loop, with which no URDF
-    is read, and with those whose axis is zero, which Pinocchio reads as joints that move nothing.
+    """InputError with all joints that lack a <limit>, or close a loop, with which no URDF is read, and with
+    those whose axis is zero, which Pinocchio reads as joints that move nothing.
     """
     found, parents = Mistakes(), dict[str, str]()
     for joint in root.findall("joint"):
-        limits, kind = joint.findall("limit"), joint.get("type", "")
-        name = f"URDF {urdf}: joint {joint.get('name', '')!r}"
-        if limits:
-            lacks = [key for key in ("effort", "velocity") if not limits[0].get(key, "")]
-        else:
-            lacks = ["effort", "velocity"] if kind in ("revolute", "prismatic") else []
-        if lacks:
-            keys = " and ".join(lacks)
-            found.found.append(f"{name} has no {keys} in a <limit>; give {keys} there, 0 if unknown")
+        kind, name = joint.get("type", ""), f"URDF {urdf}: joint {joint.get('name', '')!r}"
+        if kind in ("revolute", "prismatic") and not joint.findall("limit"):
+            found.found.append(f"{name} has no <limit>; give it lower, upper, effort and velocity there")
         for child in (element.get("link", "") for element in joint.findall("child")):
             if child in parents:
                 found.found.append(f"{name} moves link {child!r}, as {parents[child]!r} does; take one out")
@@ -125,13 +119,13 @@ def _check_joints(root: Element, urdf: str) -> None:
 def _for_pinocchio(root: Element) -> Element:
     """Copy of a URDF that Pinocchio reads.
 
-    Negative limits of torque and speed, which stand for none as in SDF, are 0; without capsules, which its
-    parser calls errors.
+    Limits of torque and speed that are missing, or negative, which stands for none as in SDF, are 0; without
+    capsules, which its parser calls errors.
     """
     out = deepcopy(root)
     for limit in out.findall("joint/limit"):
         for key in ("effort", "velocity"):
-            if _urdf_number(limit.get(key, "")) < 0:
+            if not limit.get(key, "") or _urdf_number(limit.get(key, "")) < 0:
                 limit.set(key, "0")
     for link in out.findall("link"):
         for shape in (*link.findall("visual"), *link.findall("collision")):

@@ -94,8 +94,19 @@ def test_limits_that_a_urdf_must_have_are_named_for_all_joints(tmp_path: Path) -
     path.write_text(before + last[last.index("/>") + 2 :])
     with pytest.raises(InputError) as error:
         Robot.from_urdf(path)
-    lacks = [mistake.split("has no ")[1].split(" in a <limit>")[0] for mistake in error.value.mistakes]
-    assert lacks == ["effort", "effort and velocity"]
+    assert len(error.value.mistakes) == 1 and "has no <limit>; give it" in error.value.mistakes[0]
+
+
+def test_a_missing_effort_is_one_of_zero(tmp_path: Path) -> None:
+    """URDF requires it; other parsers read it as none, and so do files."""
+    messages = []
+    for effort in ("", ' effort="0"'):
+        path = tmp_path / "walker.urdf"
+        path.write_text(urdfs.biped().replace(' effort="80.0"', effort, 1))
+        with pytest.raises(InputError, match="no usable torque limit") as error:
+            Robot.from_urdf(path)
+        messages.append(str(error.value))
+    assert messages[0] == messages[1]
 
 
 def test_a_joint_whose_axis_is_zero_is_named(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ constraints there as its bodies are near. During contact all its collocation poi
 clearance at the adjacent nodes is raised instead where nodes are too dense for another one.
 
 A constraint has the target's bodies where they were in the iterate at which it entered. It is placed anew if
-the solution has them elsewhere, and they are too near, or the constraint limits the objective.
+the solution has them elsewhere, and they are too near, or the constraint limits the objective of a plan with
+nodes in contact.
 """
 
 from __future__ import annotations

@@ -131,7 +131,9 @@ class BetweenNodes:
         # If the coarse contact misses an event, its optimum is not near one of the finer program.
         missed = error is not None and error.missed
         if violated is None and nodes == t.nodes and elements is None:
-            if self._margins is not None and (moved := misplaced(t, outcome.result)):
+            # Long contacts move the target far, so it differs much between iterates.
+            moved = misplaced(t, outcome.result) if self._margins is not None and t.nodes.contact else {}
+            if moved:
                 self._rounds += 1
                 return _with_target_placed(outcome, moved)
             # Nothing is missing by the estimates: the replay may still differ, and ask for finer elements.

@@ -168,7 +168,7 @@ def test_a_target_that_constraints_have_elsewhere_is_placed_anew(free: Solution,
 
 
 def test_a_plan_with_nodes_in_contact_is_solved_with_the_target_where_it_has_it(free: Solution) -> None:
-    """G1 kept off places that a box of 40 kg had left, and shoved it with 45 N s instead of 54."""
+    """G1 kept off places that a box of 40 kg had left, and shoved it with 45 N s instead of 51."""
     old, margins = program_of(free, free.problem), Margins(free.problem)
     t = Transcription(free.problem, block_functions(free.problem), free.nodes._replace(contact=True))
     x = warm_start(t, old, free.result.x, np.zeros(old.program.m), np.zeros(old.layout.n))[0]

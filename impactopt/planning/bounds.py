@@ -312,16 +312,15 @@ def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> It
         name, _ = t.program.describe_violation(worst, x, float(violations[worst]))
         where = f"; {name.partition(', ')[2]}"
     for field in fields(term):
-        given = getattr(term, field.name)
-        by_joint = isinstance(given, Mapping)
+        given, about = getattr(term, field.name), about_field.get(field.name)
+        by_joint = about is not None and about.by_joint and isinstance(given, Mapping)
         old = 1.0 if by_joint else given  # a table by joint is searched for a factor of all its numbers
         # Only numbers are searched for a value; an infinite one bounds nothing.
         if isinstance(old, bool) or not isinstance(old, float) or not np.isfinite(old):
             continue
 
-        def at(value: float, name: str = field.name, given: Any = given) -> Term:
-            table = isinstance(given, Mapping)
-            new = {joint: value * one for joint, one in given.items()} if table else value
+        def at(value: float, name: str = field.name, given: Any = given, by_joint: bool = by_joint) -> Term:
+            new = {joint: value * one for joint, one in given.items()} if by_joint else value
             return replace(term, **{name: new})
 
         def violation_at(value: float, at: Callable[[float], Term] = at) -> float:
@@ -334,7 +333,7 @@ def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> It
         if needed is None:
             continue
         value = _outward(needed, old)
-        unit = about_field[field.name].unit if field.name in about_field else ""
+        unit = "" if about is None else about.unit
         instead = f"instead of {old:.3g}{' ' + unit if unit else ''}"
         text = f"{term.name}: {value:.3g} {'times the limit of each joint' if by_joint else instead}"
         new = changed_or_none(t.problem, terms=with_term(t.problem, at(value)))

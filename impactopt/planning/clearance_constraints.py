@@ -7,8 +7,12 @@ constraint penetrate at its end, or end on the other side of each other. So bodi
 other on which they began.
 
 If two bodies violate their clearance between two nodes, the program gets a node at that instant, and
-constraints there as its bodies are near. The required clearance at the adjacent nodes is raised instead where
-nodes are too dense for another one, and during contact, which gets no further nodes.
+constraints there as its bodies are near. During contact all its collocation points become nodes. The required
+clearance at the adjacent nodes is raised instead where nodes are too dense for another one.
+
+A constraint has the target's bodies where they were in the iterate at which it entered. It is placed anew if
+the solution has them elsewhere, and they are too near, or the constraint limits the objective of a plan with
+nodes in contact.
 """
 
 from __future__ import annotations
@@ -350,6 +354,8 @@ MAX_RAISE = 0.02  # [m] of the clearance required at a node, in one round
 # [m] only pieces of a pair that are nearer than its nearest two plus this get a raised clearance
 RAISED_WITHIN = 0.01
 MAX_MOVED = 1e-3  # [m] of the target between a constraint and the solution, without another solve
+# Share of the objective that constraints with the target elsewhere may cost, without another solve.
+MAX_MISPLACED_COST = 0.01
 MIN_NODE_INTERVAL = 2e-3  # [s] between a new node and its neighbours
 END_FRACTION = 0.2  # of the interval of two nodes: a new one stays so far from either
 
@@ -453,6 +459,42 @@ def _near(margins: Margins, at: Places, share: float) -> list[tuple[int, Pair, f
     return out
 
 
+def misplaced(t: Transcription, result: SolverResult) -> Constraints:
+    """Constraints that have the target's bodies elsewhere than a solution, with their places there; none if
+    these limit the objective by little.
+    """
+    # clearance constraints come last
+    multipliers = result.multipliers[len(result.multipliers) - len(t.clearance_constraints) :]
+    price = dict(zip(t.clearance_constraints, np.abs(multipliers).tolist(), strict=True))  # per metre
+    moved = _moved_constraints(t, node_placements(t, result.x))
+    cost = sum(price[key] * _moved_by(t, key, new) for key, new in moved.items())
+    return moved if cost > MAX_MISPLACED_COST * abs(result.objective) else {}
+
+
+def _moved_constraints(t: ContactProgram, nodes: NodePlacements) -> Constraints:
+    """Constraints that have their bodies more than `MAX_MOVED` from where they are at the nodes, with their
+    places there.
+    """
+    number = {name: k for k, name in enumerate(nodes.names)}
+    out = Constraints()
+    for key, held in t.clearance_constraints.items():
+        k = number[key.place]
+        aside = tuple(nodes.at.aside[k].tolist())
+        new = held._replace(travel=float(nodes.at.travel[k]), aside=aside)
+        if _moved_by(t, key, new) > MAX_MOVED:
+            out[key] = new
+    return out
+
+
+def _moved_by(t: ContactProgram, key: ClearanceKey, new: SeparatingDirection) -> float:
+    """Distance [m] of a constraint's other body from where a new one has it."""
+    if key.other >= 0:
+        return 0.0
+    body, normal = t.problem.bodies.world[-1 - key.other], t.problem.bodies.normal
+    places = (held.placed(body, normal).translation for held in (t.clearance_constraints[key], new))
+    return float(np.linalg.norm(np.subtract(*places)))
+
+
 class _RaisedClearances:
     """Constraints of a program with a larger required distance than they have."""
 
@@ -461,6 +503,7 @@ class _RaisedClearances:
         shapes = margins.bodies.shapes
         directions = np.zeros((len(nodes.names), len(shapes), 3))
         self._gaps = shapes.look(margins.bodies.placed(nodes.at), np.inf, directions, margins.wanted).gaps
+        self._moved = _moved_constraints(t, nodes)
 
     def add(self, adjacent: Sequence[int], pair: Pair, distance: float) -> None:
         """Raise the required clearance of two bodies at these nodes by what their distance [m] lacks."""
@@ -473,12 +516,9 @@ class _RaisedClearances:
             }
             gaps = {key: float(self._gaps[k, index[key[1:]]]) for key in own}
             nearest = min(gaps.values(), default=0.0)
-            travel, aside = float(self._nodes.at.travel[k]), tuple(self._nodes.at.aside[k].tolist())
             for key, held in own.items():
-                # A constraint has the other body where the target was in the initial guess.
-                if pair[1] < 0 and abs(held.travel - travel) > MAX_MOVED:
-                    moved = held._replace(travel=travel, aside=aside)
-                    self.constraints[ClearanceKey(*key)] = moved
+                if key in self._moved:
+                    self.constraints[key] = self._moved[key]
                 elif gaps[key] < nearest + RAISED_WITHIN:
                     raised = self.constraints.get(key, held).least_distance
                     least = max(held.least_distance, raised, nearest + missing)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pinocchio as pin
@@ -199,6 +199,20 @@ def test_a_wide_range_of_durations_starts_from_a_usual_one(arm: ImpactProblem) -
     """From the middle of 0.4 to 50 s the arm would be guessed nearly still at contact."""
     wide = dataclasses.replace(arm.swing, duration=(0.4, 50.0))
     assert solve(dataclasses.replace(arm, swing=wide)).status.usable
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Noted(JointAcceleration):
+    """A term of a user's own, with a table that is no limit."""
+
+    notes: Mapping[str, str] = dataclasses.field(default_factory=lambda: {"shoulder": "weak"})
+
+
+def test_a_table_of_a_term_of_ones_own_is_no_limit() -> None:
+    """Its texts were multiplied by a factor: a TypeError in place of the reason that there is no plan."""
+    t = transcribed(dataclasses.replace(arm_problem(), terms=(*BODILESS, Noted(limit=2.0))))
+    (bound,) = [b for b in bounds_of(t) if b.name == Noted.name]
+    assert [cause.text for cause in bound.causes(first_iterate(t))]
 
 
 def test_a_limit_by_joint_is_named_as_one_for_all_joints_is() -> None:

@@ -676,7 +676,7 @@ def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) ->
 
 @pytest.mark.slow
 def test_an_arm_in_a_plane_near_the_ground_strikes(tmp_path: Path) -> None:
-    """Two joints about vertical axes, with links at a height of 10 cm."""
+    """Two joints about vertical axes, with links at a height of 10 cm; not so below the ground."""
     box, limits = (0.5, 0.06, 0.04), (-2.5, 2.5)
     text = urdfs.robot(
         "planar",
@@ -688,6 +688,8 @@ def test_an_arm_in_a_plane_near_the_ground_strikes(tmp_path: Path) -> None:
     )
     draft = _drafted(tmp_path, text)
     assert any("the hardest of those tried" in line for line in draft.said)
+    with pytest.raises(InputError, match="'hand' hangs 0.35 m below the ground; place the root higher"):
+        _drafted(tmp_path, text.replace('xyz="0.0 0.0 0.06"', 'xyz="0.0 0.0 -0.35"'))
 
 
 @pytest.mark.slow

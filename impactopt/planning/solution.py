@@ -396,7 +396,8 @@ class Solution(Solved):
 
         Raises
         ------
-        InputError : one of these is no `Simulation`, or of another plan; `simulation` missed the target.
+        InputError : one of these is no `Simulation`, or of another plan; `simulation` never
+            touched its target.
         """
         plan = self.plan
         check_simulations(self.trajectory, simulation=simulation, replay=replay)

@@ -688,7 +688,7 @@ def test_an_arm_in_a_plane_near_the_ground_strikes(tmp_path: Path) -> None:
     )
     draft = _drafted(tmp_path, text)
     assert any("the hardest of those tried" in line for line in draft.said)
-    with pytest.raises(InputError, match="'hand' hangs 0.35 m below the ground; place the root higher"):
+    with pytest.raises(InputError, match=r"'hand' hangs 0.35 m below the ground; place the root higher"):
         _drafted(tmp_path, text.replace('xyz="0.0 0.0 0.06"', 'xyz="0.0 0.0 -0.35"'))
 
 

@@ -1070,6 +1070,16 @@ def test_a_joint_that_its_damping_holds_is_locked(tmp_path: Path, damping: float
     assert (draft_robot(path).locked.get("turn") == "held by its damping") == held
 
 
+def test_joints_that_their_damping_holds_are_named_where_nothing_is_drafted(tmp_path: Path) -> None:
+    """The message was to check the joints, or of a leg without the knee that was locked."""
+    damping = '<dynamics damping="1e7"/></joint>'
+    with pytest.raises(InputError, match=r"no joint is left to move; locked: .*turn \(held by its damping\)"):
+        _drafted(tmp_path, urdfs.arm().replace("</joint>", damping))
+    stiff = re.sub(r'(<joint name="left_knee".*?)</joint>', rf"\1{damping}", urdfs.biped())
+    with pytest.raises(InputError, match="joints held by their damping, locked: left_knee; no posture"):
+        _drafted(tmp_path, stiff)
+
+
 def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
     """Fetch's arm was to strike 2.4 m beside it, where no swing of a second takes its base."""
     text = urdfs.arm().replace('<parent link="base"/>', '<parent link="mobile"/>', 1)

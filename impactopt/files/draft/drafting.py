@@ -20,7 +20,7 @@ from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.errors import InputError, counted
 from impactopt.files.draft.default_drives import DOUBT, published_limits
 from impactopt.files.draft.hits import Hit, hits
-from impactopt.files.draft.limbs import NO_RANGE, Limb, renumbered
+from impactopt.files.draft.limbs import HELD, NO_RANGE, Limb, renumbered
 from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import FIXED, Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
@@ -114,7 +114,7 @@ def draft_problem(
     except InputError as error:
         # the reason, where a robot of that size, with such shapes or limits has no sole or posture
         causes = [*unit_doubts(drafted.robot), *shape_doubts(drafted.robot)]
-        for why, what in ((NO_RANGE, "without a range"), (FIXED, FIXED)):
+        for why, what in ((NO_RANGE, "without a range"), (FIXED, FIXED), (HELD, "held by their damping")):
             if names := sorted(joint for joint, reason in drafted.locked.items() if reason == why):
                 causes.append(f"joints {what}, locked: {', '.join(names)}")
         if drafted.turn:

@@ -124,6 +124,9 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
             f"{path}: its links have no mass, so no motion can be planned; give each an <inertial>, with "
             "mass and inertia"
         )
+    if locked and len(locked) == first.model.njoints - 1 - is_floating(first.model):
+        why = ", ".join(f"{joint} ({reason})" for joint, reason in locked.items())
+        raise InputError(f"{path}: no joint is left to move; locked: {why}")
     floats = is_floating(first.model) and float(first.model.inertias[1].mass) > 0 and not ties
     found = _made(path, mjcf, floats, locked)
     if is_floating(first.model) and not floats:

@@ -1389,18 +1389,21 @@ def test_an_mjcf_of_a_walker_without_a_free_joint_stands(tmp_path: Path) -> None
     assert not draft_robot(xml, mjcf=True, bolted=True).robot.floating
 
 
-def test_a_floating_mjcf_that_does_not_stand_is_bolted_and_told(tmp_path: Path) -> None:
-    """A walker that lies on its back with all joints at zero."""
+@pytest.mark.parametrize("lies", ["0.7071068 0.7071068 0 0", "0 1 0 0"], ids=["on its back", "head down"])
+def test_a_floating_mjcf_that_does_not_stand_is_bolted_and_told(tmp_path: Path, lies: str) -> None:
+    """A walker that lies with all joints at zero."""
     xml = _walker(tmp_path)
     assert not draft_robot(xml, mjcf=True).fixed
-    xml.write_text(re.sub(r'(<body name="trunk"[^>]*)>', r'\1 euler="90 0 0"><freejoint/>', xml.read_text()))
+    xml.write_text(re.sub(r'(<body name="trunk"[^>]*)>', rf'\1 quat="{lies}"><freejoint/>', xml.read_text()))
     draft = draft_robot(xml, mjcf=True)
     assert draft.fixed and not draft.robot.floating
     bolted = draft_robot(xml, mjcf=True, bolted=True)
     assert not bolted.fixed and not bolted.turn
     _, quat, _ = draft.turn.split("'")
-    xml.write_text(xml.read_text().replace('euler="90 0 0"', f'quat="{quat}"'))
+    xml.write_text(xml.read_text().replace(lies, quat))
     assert len(draft_robot(xml, mjcf=True).legs) == 2
+    trunk = pin.Quaternion(*map(float, quat.split())).matrix()
+    assert trunk[2, 2] == pytest.approx(1.0), "upright"
 
 
 @pytest.mark.slow

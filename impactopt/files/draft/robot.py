@@ -28,6 +28,7 @@ from impactopt.robots.urdf import read_urdf
 Array = NDArray[np.float64]
 # reasons for which a joint is locked; many files have no effort of joints that have a motor
 FIXED = "fixed in the file"
+UPRIGHT = 0.7  # cosine of the largest angle between a leg that stands and the vertical
 NO_MOTOR = "no motor, as the file has no effort: else unlock it, with torque_limit_N_m"
 SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may have another dot
 
@@ -169,10 +170,14 @@ def _turn(found: Drafted) -> str:
         now = pin.Quaternion(*q[[6, 3, 4, 5]])
         q[3:7] = pin.Quaternion(pin.utils.rotate(axis, np.radians(degrees)) @ now.matrix()).coeffs()
         model.referenceConfigurations[ROOT] = q
-        legs = legs_of(model, found.pieces)
-        enough = len(legs) == 2 and min(map(len, unshared(model, legs))) >= LEG - 1
+        data, legs = model.createData(), legs_of(model, found.pieces)
+        pin.forwardKinematics(model, data, q)
+        # not those of a robot that lies, on which its feet are lowest, too
+        ways = [data.oMi[1].translation - data.oMi[leg.tip].translation for leg in legs]
+        upright = all(way[2] > UPRIGHT * np.linalg.norm(way) for way in ways)
+        enough = upright and len(legs) == 2 and min(map(len, unshared(model, legs))) >= LEG - 1
         if enough and any(len(arm.own) > 1 for arm in arms_of(model, legs)):
-            quat = " ".join(f"{part:.7g}" for part in q[[6, 3, 4, 5]] + 0.0)
+            quat = " ".join(f"{part:.7g}" for part in q[[6, 3, 4, 5]].round(7) + 0.0)
             how = f", by quat='{quat}' of its <body>" if found.mjcf else ""
             return f"by {degrees} degrees about {axis}{how}"
     return ""

@@ -28,8 +28,8 @@ from impactopt.robots.urdf import read_urdf
 Array = NDArray[np.float64]
 # reasons for which a joint is locked; many files have no effort of joints that have a motor
 FIXED = "fixed in the file"
-UPRIGHT = 0.7  # cosine of the largest angle between a leg that stands and the vertical
 NO_MOTOR = "no motor, as the file has no effort: else unlock it, with torque_limit_N_m"
+UPRIGHT = 0.7  # cosine of the largest angle between a leg that stands and the vertical
 SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may have another dot
 
 
@@ -172,7 +172,7 @@ def _turn(found: Drafted) -> str:
         model.referenceConfigurations[ROOT] = q
         data, legs = model.createData(), legs_of(model, found.pieces)
         pin.forwardKinematics(model, data, q)
-        # not those of a robot that lies, on which its feet are lowest, too
+        # the feet of a robot that lies may be lowest, too
         ways = [data.oMi[1].translation - data.oMi[leg.tip].translation for leg in legs]
         upright = all(way[2] > UPRIGHT * np.linalg.norm(way) for way in ways)
         enough = upright and len(legs) == 2 and min(map(len, unshared(model, legs))) >= LEG - 1

@@ -19,7 +19,7 @@ from impactopt.bodies.convex_hulls import seen_pieces
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.errors import InputError, counted
 from impactopt.files.draft.default_drives import DOUBT, published_limits
-from impactopt.files.draft.hits import Hit, hits
+from impactopt.files.draft.hits import FORCE_PER_MASS, Hit, hits
 from impactopt.files.draft.limbs import HELD, NO_RANGE, Limb, renumbered
 from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import FIXED, Drafted, draft_robot
@@ -568,7 +568,8 @@ def _aimed(
         posture += " and from above, as drafted nails and boards are"
         remedy = (
             "draft it without --motion, and give that file [target] and [contact] of `impactopt new "
-            "arm_planar` (a nail) or `chop_arm` (a board)"
+            "arm_planar` (a nail) or `chop_arm` (a board), with resistance_N or breaking_force_N of some "
+            f"{FORCE_PER_MASS:g} N for each kg of the robot"
         )
     raise InputError(
         f"no target is found that {striker!r} can hit from {posture}; {remedy}{f': {first}' if first else ''}"

@@ -242,7 +242,9 @@ def test_a_ram_is_told_that_drafted_nails_are_struck_from_above(tmp_path: Path) 
     """It could drive one ahead, in a file drafted without a motion; the message named no direction."""
     body, ram = (urdfs.link(name, 2.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)) for name in ("base", "ram"))
     slide = urdfs.joint("slide", "base", "ram", "1 0 0", (0.0, 0.0, 1.0), (-3.0, 3.0), kind="prismatic")
-    with pytest.raises(InputError, match=r"from above, as drafted nails .* without --motion, .* 30 N for each kg"):
+    with pytest.raises(
+        InputError, match=r"from above, as drafted nails .* without --motion, .* 30 N for each kg"
+    ):
         _drafted(tmp_path, urdfs.robot("ram", body, ram, slide), motion="nail")
 
 

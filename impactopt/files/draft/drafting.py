@@ -448,9 +448,7 @@ def _hardest_planned(
             warnings.simplefilter("ignore")  # a failed trial is no result
             with contextlib.suppress(InputError):
                 problem = _built(data_of(k), folder)
-                options = {"max_iterations": ITERATIONS}
-                # Motions are compared on their first mesh: a finer one hardly changes their objectives.
-                solution = solve(problem, options=options, time_limit=SECONDS, refine=False)
+                solution = solve(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
                 if solution.status.usable:
                     found.append((sum(solution.objectives.values()), k))
     return (max(found)[1], max(found)[0]) if found else None

@@ -396,7 +396,8 @@ class Solution(Solved):
 
         Raises
         ------
-        InputError : one of these is no `Simulation`, or of another plan; `simulation` missed its target.
+        InputError : one of these is no `Simulation`, or of another plan; `simulation` had a target, and
+            never touched it.
         """
         plan = self.plan
         check_simulations(self.trajectory, simulation=simulation, replay=replay)

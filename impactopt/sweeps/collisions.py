@@ -393,10 +393,12 @@ def collide_many(
     ------
     InputError : unknown keys or outputs; columns of different lengths; values that the problem file refuses.
     """
+    columns = dict(columns) if hasattr(columns, "keys") else columns  # a pandas table is no Mapping
     check_kind("columns", columns, Mapping)
-    check_kind("at_contact", at_contact or {}, Mapping)
+    state = {} if at_contact is None else at_contact
+    check_kind("at_contact", state, Mapping)
     file = problem if isinstance(problem, ProblemFile) else read_problem_file(problem)
-    collisions = Collisions(file, at_contact or {}, outputs, keys=tuple(columns))
+    collisions = Collisions(file, state, outputs, keys=tuple(columns))
     given = {key: np.atleast_1d(raw_array(key, values)) for key, values in columns.items()}
     count = max((len(x) for x in given.values()), default=1)
     for key, values in given.items():

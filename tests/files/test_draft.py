@@ -242,7 +242,9 @@ def test_a_ram_is_told_that_drafted_nails_are_struck_from_above(tmp_path: Path) 
     """It could drive one ahead, in a file drafted without a motion; the message named no direction."""
     body, ram = (urdfs.link(name, 2.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)) for name in ("base", "ram"))
     slide = urdfs.joint("slide", "base", "ram", "1 0 0", (0.0, 0.0, 1.0), (-3.0, 3.0), kind="prismatic")
-    with pytest.raises(InputError, match=r"from above, as drafted nails .* draft it without --motion"):
+    with pytest.raises(
+        InputError, match=r"from above, as drafted nails .* without --motion, .* 30 N for each kg"
+    ):
         _drafted(tmp_path, urdfs.robot("ram", body, ram, slide), motion="nail")
 
 
@@ -676,7 +678,7 @@ def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) ->
 
 @pytest.mark.slow
 def test_an_arm_in_a_plane_near_the_ground_strikes(tmp_path: Path) -> None:
-    """Two joints about vertical axes, with links at a height of 10 cm."""
+    """Two joints about vertical axes, with links at a height of 10 cm; not so below the ground."""
     box, limits = (0.5, 0.06, 0.04), (-2.5, 2.5)
     text = urdfs.robot(
         "planar",
@@ -688,6 +690,8 @@ def test_an_arm_in_a_plane_near_the_ground_strikes(tmp_path: Path) -> None:
     )
     draft = _drafted(tmp_path, text)
     assert any("the hardest of those tried" in line for line in draft.said)
+    with pytest.raises(InputError, match=r"'hand' hangs 0.35 m below the ground; place the root higher"):
+        _drafted(tmp_path, text.replace('xyz="0.0 0.0 0.06"', 'xyz="0.0 0.0 -0.35"'))
 
 
 @pytest.mark.slow
@@ -1068,6 +1072,16 @@ def test_a_joint_that_its_damping_holds_is_locked(tmp_path: Path, damping: float
     assert (draft_robot(path).locked.get("turn") == "held by its damping") == held
 
 
+def test_joints_that_their_damping_holds_are_named_where_nothing_is_drafted(tmp_path: Path) -> None:
+    """The message was to check the joints, or of a leg without the knee that was locked."""
+    damping = '<dynamics damping="1e7"/></joint>'
+    with pytest.raises(InputError, match=r"no joint is left to move; locked: .*turn \(held by its damping\)"):
+        _drafted(tmp_path, urdfs.arm().replace("</joint>", damping))
+    stiff = re.sub(r'(<joint name="left_knee".*?)</joint>', rf"\1{damping}", urdfs.biped())
+    with pytest.raises(InputError, match="joints held by their damping, locked: left_knee; no posture"):
+        _drafted(tmp_path, stiff)
+
+
 def test_the_drives_of_a_mobile_base_are_locked(tmp_path: Path) -> None:
     """Fetch's arm was to strike 2.4 m beside it, where no swing of a second takes its base."""
     text = urdfs.arm().replace('<parent link="base"/>', '<parent link="mobile"/>', 1)
@@ -1377,18 +1391,21 @@ def test_an_mjcf_of_a_walker_without_a_free_joint_stands(tmp_path: Path) -> None
     assert not draft_robot(xml, mjcf=True, bolted=True).robot.floating
 
 
-def test_a_floating_mjcf_that_does_not_stand_is_bolted_and_told(tmp_path: Path) -> None:
-    """A walker that lies on its back with all joints at zero."""
+@pytest.mark.parametrize("lies", ["0.7071068 0.7071068 0 0", "0 1 0 0"], ids=["on its back", "head down"])
+def test_a_floating_mjcf_that_does_not_stand_is_bolted_and_told(tmp_path: Path, lies: str) -> None:
+    """A walker that lies with all joints at zero."""
     xml = _walker(tmp_path)
     assert not draft_robot(xml, mjcf=True).fixed
-    xml.write_text(re.sub(r'(<body name="trunk"[^>]*)>', r'\1 euler="90 0 0"><freejoint/>', xml.read_text()))
+    xml.write_text(re.sub(r'(<body name="trunk"[^>]*)>', rf'\1 quat="{lies}"><freejoint/>', xml.read_text()))
     draft = draft_robot(xml, mjcf=True)
     assert draft.fixed and not draft.robot.floating
     bolted = draft_robot(xml, mjcf=True, bolted=True)
     assert not bolted.fixed and not bolted.turn
     _, quat, _ = draft.turn.split("'")
-    xml.write_text(xml.read_text().replace('euler="90 0 0"', f'quat="{quat}"'))
+    xml.write_text(xml.read_text().replace(lies, quat))
     assert len(draft_robot(xml, mjcf=True).legs) == 2
+    trunk = pin.Quaternion(*map(float, quat.split())).matrix()
+    assert trunk[2, 2] == pytest.approx(1.0), "upright"
 
 
 @pytest.mark.slow

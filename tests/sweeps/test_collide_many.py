@@ -254,6 +254,15 @@ def test_the_table_has_two_digits_of_a_target_of_grams() -> None:
     assert planned.cells[0].text == "0.00075"
 
 
+def test_columns_may_be_a_table_of_pandas() -> None:
+    pandas = pytest.importorskip("pandas")
+    columns = {"target.mass": [0.1, 0.2], "at_contact.speed": [0.5, 1.0]}
+    found = collide_many(arm_file(), pandas.DataFrame(columns))["impulse_Ns"]
+    np.testing.assert_array_equal(found, collide_many(arm_file(), columns)["impulse_Ns"])
+    with pytest.raises(InputError, match="at_contact must be a Mapping"):
+        collide_many(arm_file(), columns, at_contact=np.ones(3))
+
+
 def test_structure_may_differ_from_row_to_row() -> None:
     models = ["sdc", "virtual-mass", "sdc-paper", "sdc"]
     columns = {"at_contact.model": models, "target.mass": [0.5, 0.5, 0.5, 2.0], "at_contact.speed": [1.0]}

@@ -19,8 +19,8 @@ from impactopt.bodies.convex_hulls import seen_pieces
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.errors import InputError, counted
 from impactopt.files.draft.default_drives import DOUBT, published_limits
-from impactopt.files.draft.hits import Hit, hits
-from impactopt.files.draft.limbs import NO_RANGE, Limb, renumbered
+from impactopt.files.draft.hits import FORCE_PER_MASS, Hit, hits
+from impactopt.files.draft.limbs import HELD, NO_RANGE, Limb, renumbered
 from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import FIXED, Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
@@ -114,7 +114,7 @@ def draft_problem(
     except InputError as error:
         # the reason, where a robot of that size, with such shapes or limits has no sole or posture
         causes = [*unit_doubts(drafted.robot), *shape_doubts(drafted.robot)]
-        for why, what in ((NO_RANGE, "without a range"), (FIXED, FIXED)):
+        for why, what in ((NO_RANGE, "without a range"), (FIXED, FIXED), (HELD, "held by their damping")):
             if names := sorted(joint for joint, reason in drafted.locked.items() if reason == why):
                 causes.append(f"joints {what}, locked: {', '.join(names)}")
         if drafted.turn:
@@ -448,9 +448,7 @@ def _hardest_planned(
             warnings.simplefilter("ignore")  # a failed trial is no result
             with contextlib.suppress(InputError):
                 problem = _built(data_of(k), folder)
-                options = {"max_iterations": ITERATIONS}
-                # Motions are compared on their first mesh: a finer one hardly changes their objectives.
-                solution = solve(problem, options=options, time_limit=SECONDS, refine=False)
+                solution = solve(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
                 if solution.status.usable:
                     found.append((sum(solution.objectives.values()), k))
     return (max(found)[1], max(found)[0]) if found else None
@@ -568,7 +566,8 @@ def _aimed(
         posture += " and from above, as drafted nails and boards are"
         remedy = (
             "draft it without --motion, and give that file [target] and [contact] of `impactopt new "
-            "arm_planar` (a nail) or `chop_arm` (a board)"
+            "arm_planar` (a nail) or `chop_arm` (a board), with resistance_N or breaking_force_N of some "
+            f"{FORCE_PER_MASS:g} N for each kg of the robot"
         )
     raise InputError(
         f"no target is found that {striker!r} can hit from {posture}; {remedy}{f': {first}' if first else ''}"

@@ -30,7 +30,7 @@ FOOT_HEIGHT, ROOT_HEIGHT = 0.05, 0.1
 # latter if it is on the former
 TRAVEL, TURN = 20.0, 4 * np.pi
 CREEP = 1e-3  # [m/s], [rad/s] at which the damping of a joint that is held exceeds the robot's weight, at 1 m
-NO_RANGE = "no range"  # reason for which a joint is locked
+NO_RANGE, HELD = "no range", "held by its damping"  # reasons for which a joint is locked
 TOE = 0.03  # [m] from an ankle to a toe's joint, at least; half of it: largest height of foot over toe
 
 
@@ -105,7 +105,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             steering += [i for i in children[j] if np.ptp(range_of(model, i)) > TURN]
             out |= {str(model.names[i]): "drives a base" for i in steering}
         elif joint.nv == 1 and CREEP * viscous[joint.idx_v] > 9.81 * total:
-            out[name] = "held by its damping"
+            out[name] = HELD
     for j in range(first, model.njoints):  # a hand: several short and light chains on one link
         small = [c for c in children[j] if mass[c] < FINGER_MASS * total and reach[c] < FINGER_LENGTH]
         if len(small) > 1 and len(small) == len(children[j]):

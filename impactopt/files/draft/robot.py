@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 # reasons for which a joint is locked; many files have no effort of joints that have a motor
 FIXED = "fixed in the file"
 NO_MOTOR = "no motor, as the file has no effort: else unlock it, with torque_limit_N_m"
+UPRIGHT = 0.7  # cosine of the largest angle between a leg that stands and the vertical
 SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may have another dot
 
 
@@ -124,6 +125,9 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
             f"{path}: its links have no mass, so no motion can be planned; give each an <inertial>, with "
             "mass and inertia"
         )
+    if locked and len(locked) == first.model.njoints - 1 - is_floating(first.model):
+        why = ", ".join(f"{joint} ({reason})" for joint, reason in locked.items())
+        raise InputError(f"{path}: no joint is left to move; locked: {why}")
     floats = is_floating(first.model) and float(first.model.inertias[1].mass) > 0 and not ties
     found = _made(path, mjcf, floats, locked)
     if is_floating(first.model) and not floats:
@@ -166,10 +170,14 @@ def _turn(found: Drafted) -> str:
         now = pin.Quaternion(*q[[6, 3, 4, 5]])
         q[3:7] = pin.Quaternion(pin.utils.rotate(axis, np.radians(degrees)) @ now.matrix()).coeffs()
         model.referenceConfigurations[ROOT] = q
-        legs = legs_of(model, found.pieces)
-        enough = len(legs) == 2 and min(map(len, unshared(model, legs))) >= LEG - 1
+        data, legs = model.createData(), legs_of(model, found.pieces)
+        pin.forwardKinematics(model, data, q)
+        # the feet of a robot that lies may be lowest, too
+        ways = [data.oMi[1].translation - data.oMi[leg.tip].translation for leg in legs]
+        upright = all(way[2] > UPRIGHT * np.linalg.norm(way) for way in ways)
+        enough = upright and len(legs) == 2 and min(map(len, unshared(model, legs))) >= LEG - 1
         if enough and any(len(arm.own) > 1 for arm in arms_of(model, legs)):
-            quat = " ".join(f"{part:.7g}" for part in q[[6, 3, 4, 5]] + 0.0)
+            quat = " ".join(f"{part:.7g}" for part in q[[6, 3, 4, 5]].round(7) + 0.0)
             how = f", by quat='{quat}' of its <body>" if found.mjcf else ""
             return f"by {degrees} degrees about {axis}{how}"
     return ""

@@ -141,7 +141,7 @@ def _candidates(
 
 def _floor(height: float) -> float:
     """Least height [m] of a striking point that has to reach a height: an arm may move in a low plane."""
-    return min(LOWEST / 2, height) - LEVEL
+    return min(LOWEST / 2, max(height, 0.0)) - LEVEL
 
 
 def strike_problem(

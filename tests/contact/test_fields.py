@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from pathlib import Path
+import pkgutil
 from typing import Any
 
 import pytest
@@ -36,8 +36,9 @@ def test_each_class_is_listed_and_public(name: str) -> None:
     """A class whose line in the package's list was forgotten is found here."""
     kinds, others = FAMILIES[name]
     package = importlib.import_module(f"impactopt.{name}")
-    files = [path.stem for path in Path(str(package.__file__)).parent.glob("*.py") if path.stem != "__init__"]
-    modules = [importlib.import_module(f"impactopt.{name}.{file}") for file in files]
+    # a family is one file, or a folder of files
+    files = pkgutil.iter_modules(getattr(package, "__path__", ()), f"impactopt.{name}.")
+    modules = [package, *(importlib.import_module(file.name) for file in files)]
     family = {
         thing
         for module in modules

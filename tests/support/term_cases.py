@@ -190,7 +190,7 @@ CASES: dict[str, Case] = {
         JointAcceleration(limit=200.0),
         joint_acceleration,
     ),
-    "joint jerk": Case(JointJerk(limit=600.0), JointJerk(limit=800.0), JointJerk(limit=1e5), joint_jerk),
+    "joint jerk": Case(JointJerk(limit=300.0), JointJerk(limit=400.0), JointJerk(limit=1e5), joint_jerk),
     "gear load": Case(GearLoad(limit=0.6), GearLoad(limit=0.7), GearLoad(limit=1.0)),
     "motor curve": Case(MotorCurve(fraction=0.2), MotorCurve(fraction=0.25), MotorCurve()),
     "power limit": Case(PowerLimit(limit=30.0), PowerLimit(limit=40.0), PowerLimit(limit=200.0)),

@@ -363,7 +363,6 @@ def with_limits_kept(
 
     collision : of the plan, on a finer mesh if there is one.
     """
-    term = plan.problem.term(Slide)
     with contextlib.suppress(InputError):  # legs out of reach: completing the motion reports it
         if short := shortfalls(plan.sole_margins(collision)):
             message = (
@@ -371,7 +370,7 @@ def with_limits_kept(
             )
         elif beyond := _joints_beyond(plan, robot):
             message = f"Between nodes {beyond}; give more `intervals`, or more time."
-        elif term in plan.problem.on_demand and (far := slides_beyond(term, plan)):
+        elif far := _slide_beyond(plan):
             message = (
                 f"Between collocation points {far}; give more elements in `compression` and `restitution` of "
                 "[collision]."
@@ -386,10 +385,12 @@ def lost_in_contact(plan: Plan, collision: PlannedCollision) -> bool:
     """True if a plan loses limits of soles or of the slide between collocation points; collision: as of
     `with_limits_kept`.
     """
-    term = plan.problem.term(Slide)
-    if shortfalls(plan.sole_margins(collision), "collision"):
-        return True
-    return term in plan.problem.on_demand and bool(slides_beyond(term, plan))
+    return bool(shortfalls(plan.sole_margins(collision), "collision") or _slide_beyond(plan))
+
+
+def _slide_beyond(plan: Plan) -> str:
+    """Message with a slide beyond its limit between collocation points; "" if there is none."""
+    return next((slides_beyond(t, plan) for t in plan.problem.on_demand if isinstance(t, Slide)), "")
 
 
 def _joints_beyond(plan: Plan, robot: Robot) -> str:

@@ -77,8 +77,7 @@ class CollisionPage(LivePage):
             )
         self._y, self._legs = c.split(problem.contact_posture)
         self._polygon = support_polygon(problem.robot, c)
-        names = ("robot", "striker", "normal", "law", "target", "stance")
-        self._model = SDC(**{name: getattr(problem, name) for name in names}, freezes=_FREEZES)
+        self._model = SDC(**problem.scene, freezes=_FREEZES)
         self._server, self.address = served(host, port)
         self._drawing = Drawing(self._server, problem.robot, problem.ground_height)
         self._drawing.normal = problem.normal

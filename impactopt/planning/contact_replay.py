@@ -152,19 +152,21 @@ class PlannedContact:
         if not problem.lasts or not duration > 0:
             return None
         try:
-            found = follow_contact(
-                problem.robot,
-                self.reference,
-                scene_of(problem),
-                step=min(_MAX_STEP, duration / _MIN_STEPS),
-                # a strike plans no motion after contact that moves the striker away
-                until=duration * (_REPLAY_LENGTH if isinstance(planned, Plan) else 1.0),
-                longest=_MAX_REPLAY_LENGTH * duration,
-            )
+            # a strike plans no motion after contact that moves the striker away
+            length = _REPLAY_LENGTH if isinstance(planned, Plan) else 1.0
+            found = _followed(problem, self.reference, duration, length * duration)
         except InputError:  # legs out of reach
             return None
         known = 0.0 if self.model_error is None else self.model_error.impulse_pct
         return _contact_replay(problem, planned, found, known)
+
+
+def _followed(problem: ImpactProblem, reference: Trajectory, duration: float, until: float) -> Followed:
+    """The contact of about this duration [s] in full dynamics, at least `until` [s] after it began."""
+    step, longest = min(_MAX_STEP, duration / _MIN_STEPS), _MAX_REPLAY_LENGTH * duration
+    return follow_contact(
+        problem.robot, reference, scene_of(problem), step=step, until=until, longest=longest
+    )
 
 
 def _contact_replay(
@@ -272,14 +274,7 @@ def _error_without_duration(problem: ImpactProblem, plan: Plan, duration: float)
     Its reference does not coast in contact, but begins the follow-through at once, which takes impulse away.
     """
     with contextlib.suppress(InputError):  # legs out of reach
-        found = follow_contact(
-            problem.robot,
-            plan.coarse_reference,
-            scene_of(problem),
-            step=min(_MAX_STEP, duration / _MIN_STEPS),
-            until=duration,
-            longest=_MAX_REPLAY_LENGTH * duration,
-        )
+        found = _followed(problem, plan.coarse_reference, duration, until=duration)
         if found.impulse > 0:
             return ModelError(impulse_pct=100 * (plan.impulse / found.impulse - 1), zmp_mm=None)
     return None
@@ -294,10 +289,8 @@ def collision_error(
     None if a contact does not end, and for an SDC of a robot with soft grips. With these, full dynamics are
     in the place of the often frozen SDC.
     """
-    names = ("robot", "striker", "normal", "law", "target", "stance")
-    scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
     # Time for the contact to end with either model.
-    scene["horizon"] = max(_MIN_HORIZON, 4 * duration)
+    scene = {**problem.scene, "horizon": max(_MIN_HORIZON, 4 * duration)}
     own = frozen_model(problem.collision, problem.freezes, **scene)
     # Four times as often as the model itself, to be more accurate than it.
     freezes = min(max(_MIN_FREEZES, 4 * problem.freezes), _MAX_FREEZES)

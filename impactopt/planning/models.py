@@ -201,10 +201,8 @@ def endless(problem: ImpactProblem) -> list[str]:
     """
     if problem.collision != "sdc-paper" or problem.target.guards:
         return []
-    names = ("robot", "striker", "normal", "law", "target", "stance")
-    scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
     try:
-        model = frozen_model(problem.collision, **scene, horizon=_ENDLESS)
+        model = frozen_model(problem.collision, **problem.scene, horizon=_ENDLESS)
         tested = [_state_at_contact(problem, part) for part in (_TEST_FRACTION, _TEST_FRACTION / 5)]
         ends = [model.collide(*state, require_separation=False).separated for _, state in tested]
     except InputError:  # no posture to test in

@@ -310,6 +310,12 @@ class ImpactProblem:
         return {"sdc": Effects(), "sdc-paper": Effects.paper()}.get(self.collision)
 
     @property
+    def scene(self) -> dict[str, Any]:
+        """Arguments of a collision model that are about the robot and what it hits."""
+        names = ("robot", "striker", "normal", "law", "target", "stance")
+        return {name: getattr(self, name) for name in names}
+
+    @property
     def gain_joints(self) -> tuple[tuple[int, ...], ...]:
         """Indices of the joints of each `GainFactor` in `gains`."""
         return tuple(gain.indices(self.robot) for gain in self.gains)

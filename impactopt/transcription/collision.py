@@ -551,8 +551,8 @@ class Collision(ContactParameters):
         acceleration = [jump_at_contact(b.problem, c, law, y, rates, legs)[3]]
         for i in range(len(self.stages)):
             # slots of `_motion`; the S among them is one
-            y0, d1, T1, d, T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i))
-            y = y0 + T1 * d1 + T * d
+            T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i)[4:])
+            y = self._position(x, i)
             _, v, a = c.complete_motion(y, u, slope / T, legs_there)
             motion.append((y, u))
             velocity.append(v[c.base :])
@@ -719,8 +719,12 @@ class Collision(ContactParameters):
     def write_positions(self, x: Array) -> None:
         """Write the positions `y` that the other variables determine to x (n,)."""
         for i in range(self.y.count):
-            y0, d1, T1, d, T = (e.evaluate(x) for e in self._motion(i)[:5])
-            x[self.y.index(i)] = y0 + T1 * d1 + T * d
+            x[self.y.index(i)] = self._position(x, i)
+
+    def _position(self, x: Array, i: int) -> Array:
+        """Position (ny,) at a stage, for solver variables x (n,)."""
+        y0, d1, T1, d, T = (e.evaluate(x) for e in [self.contact.state.y, *self._travel(i)])
+        return y0 + T1 * d1 + T * d
 
     @property
     def state_after(self) -> list[Affine]:

@@ -59,25 +59,24 @@ class Places:
     """Placements of the bodies at k instants.
 
     rotation (k, joints, 3, 3), translation (k, joints, 3) [m] : of the model's joints.
-    travel (k,) [m] : of the target along its normal.  aside (k, 3) [m] : across it, by friction.
+    displacement (k, 3) [m] : of the target.
     phase (k,) : 0 before, 1 in, 2 after contact; 3: without a target.
     """
 
     rotation: Array
     translation: Array
-    travel: Array
-    aside: Array
+    displacement: Array
     phase: Index
 
     @classmethod
-    def of(cls, robot: Robot, q: Array, travel: Array, phase: Index, aside: Array | None = None) -> Places:
-        """Placements for configurations q (k, nq); aside None: the target stays on its normal."""
+    def of(cls, robot: Robot, q: Array, phase: Index, displacement: Array | None = None) -> Places:
+        """Placements for configurations q (k, nq); displacement None: the target is at its place."""
         rotation, translation = robot.forward_kinematics(q)
-        aside = np.zeros((len(travel), 3)) if aside is None else aside
-        return cls(rotation=rotation, translation=translation, travel=travel, aside=aside, phase=phase)
+        moved = np.zeros((len(phase), 3)) if displacement is None else displacement
+        return cls(rotation=rotation, translation=translation, displacement=moved, phase=phase)
 
     def __len__(self) -> int:
-        return len(self.travel)
+        return len(self.phase)
 
     def part(self, first: int, last: int) -> Places:
         """Placements at the instants first, ..., last - 1."""
@@ -85,8 +84,7 @@ class Places:
         return Places(
             rotation=self.rotation[chosen],
             translation=self.translation[chosen],
-            travel=self.travel[chosen],
-            aside=self.aside[chosen],
+            displacement=self.displacement[chosen],
             phase=self.phase[chosen],
         )
 
@@ -123,25 +121,22 @@ class Bodies:
         world: tuple[WorldBody, ...],
         start: Array,
         *,
-        normal: Array,
         striking: tuple[int, ...],
         standing: tuple[int, ...],
         strict: bool,
     ) -> None:
         """start (nq,) : posture; links that touch in it, or nearly (`FITTED`), are not checked.
 
-        normal (3,) : of the target.
-
         strict : refuse a start posture that penetrates a body of the world.
         striking, standing : joints of the striking links, and of the feet on fixed soles.
         """
-        self.robot, self.world, self.normal, self.striking = robot, world, normal, striking
+        self.robot, self.world, self.striking = robot, world, striking
         self.start, self.standing = start, standing
         self.links: RobotBodies = bodies_of(robot)
         left_out = {frozenset(pair) for pair in robot.disable_collisions}
         self.pairs, touching = self.links.piece_pairs(start, left_out)
         self.overlaps = sorted((min(pair), max(pair)) for pair in self.links.overlaps(touching))
-        at = Places.of(robot, start[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+        at = Places.of(robot, start[None], np.zeros(1, dtype=np.intp))
         self.world_pairs: list[Pair] = []
         self._first_lowered = len(world)  # index of the first ground that is lowered for a link on it
         for w, body in enumerate(world):
@@ -189,7 +184,7 @@ class Bodies:
         for w, body in enumerate(self.world):
             world[:, w, :9] = body.rotation.ravel()
             # Only the target moves.
-            world[:, w, 9:] = body.place + (np.outer(at.travel, self.normal) + at.aside) * body.moves
+            world[:, w, 9:] = body.place + at.displacement * body.moves
             present[:, w] = self.present(body, at)
         return Placed(np.ascontiguousarray(joints), world, present)
 
@@ -262,7 +257,7 @@ class Bodies:
         if body >= 0:
             return at.rotation[k, body], at.translation[k, body]
         solid = self.world[-1 - body]
-        return solid.rotation, solid.place + (at.travel[k] * self.normal + at.aside[k]) * solid.moves
+        return solid.rotation, solid.place + at.displacement[k] * solid.moves
 
     def lower_bounds(self, at: Places, within: float) -> Iterator[tuple[float, int, Pair]]:
         """Smooth distances [m] below ``within``, with instant and pair, by increasing distance.

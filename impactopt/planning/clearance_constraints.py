@@ -9,10 +9,6 @@ other on which they began.
 If two bodies violate their clearance between two nodes, the program gets a node at that instant, and
 constraints there as its bodies are near. During contact all its collocation points become nodes. The required
 clearance at the adjacent nodes is raised instead where nodes are too dense for another one.
-
-A constraint has the target's bodies where they were in the iterate at which it entered. It is placed anew if
-the solution has them elsewhere, and they are too near, or the constraint limits the objective of a plan with
-nodes in contact.
 """
 
 from __future__ import annotations
@@ -89,9 +85,7 @@ class Margins:
     def __init__(self, problem: ImpactProblem) -> None:
         self.bodies: Bodies = problem.bodies
         self.own, self.world = problem.self_collision, problem.keep_out
-        self._start = Places.of(
-            problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp)
-        )
+        self._start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1, dtype=np.intp))
         self._required: dict[Pair, float] = {}
         shapes = self.bodies.shapes
         # The second entry is a joint, or -1 - index of a body of the world.
@@ -148,11 +142,9 @@ def node_placements(t: ContactProgram, x: Array) -> NodePlacements:
     """Placements of all bodies at all nodes of a program, for solver variables x (n,)."""
     states = t.body_states(x)
     phase, time = np.array([s.phase for s in states], dtype=np.intp), np.array([s.time for s in states])
-    travel, aside = t.displacement(x, time)
-    q = np.array([s.q for s in states])
-    return NodePlacements(
-        names=tuple(s.name for s in states), time=time, at=Places.of(t.robot, q, travel, phase, aside)
-    )
+    q, moved = np.array([s.q for s in states]), np.array([d.evaluate(x) for d in t.displacements])
+    at = Places.of(t.robot, q, phase, moved)
+    return NodePlacements(names=tuple(s.name for s in states), time=time, at=at)
 
 
 class Watch:
@@ -168,14 +160,13 @@ class Watch:
     """
 
     def __init__(self, t: ContactProgram, margins: Margins, x: Array) -> None:
-        """x (n,) : initial guess; the target's travel and the nodes' phases stay as they are there."""
+        """x (n,) : initial guess."""
         self._t, self._margins, self._shapes = t, margins, margins.bodies.shapes
         placements = node_placements(t, x)
         self._names, self._phase = placements.names, placements.at.phase
-        self._travel, self._aside = placements.at.travel, placements.at.aside
-        parts_of = {node.name: parts for node, parts in t.body_spots}
-        lift = stack([part for name in self._names for part in parts_of[name]])
-        # coordinates and legs of all nodes are self._lift @ x + self._const
+        spots = zip(t.body_spots, t.displacements, strict=True)
+        lift = stack([part for (_, slots), moved in spots for part in (*slots, moved)])
+        # coordinates, legs and the target's displacement at all nodes are self._lift @ x + self._const
         self._lift, self._const = lift.matrix(t.layout.n), lift.const
         shape = len(self._names), len(self._shapes)
         # separating directions (K, P, 3), zero if unknown; mask (K, P) of the pairs that have a constraint
@@ -207,9 +198,8 @@ class Watch:
         for k, n in zip(near.spot[new].tolist(), near.pair[new].tolist(), strict=True):
             (joint, other), number = self._shapes.pairs[n].tolist(), int(self._shapes.number[n])
             direction, distance = self._directions[k, n].tolist(), float(self._margins.pieces[n])
-            out[ClearanceKey(self._names[k], joint, other, number)] = SeparatingDirection(
-                tuple(direction), distance, float(self._travel[k]), tuple(self._aside[k].tolist())
-            )
+            key = ClearanceKey(self._names[k], joint, other, number)
+            out[key] = SeparatingDirection(tuple(direction), distance)
         # Each (instant, pair) occurs once in `near`, so that fancy assignment is safe.
         self._has[near.spot, near.pair] |= new
         self.left = False
@@ -259,9 +249,8 @@ class Watch:
     def _placed(self, x: Array) -> Placed:
         c, ny = self._t.coordinates, self._t.builder.ny
         z = (self._lift @ x + self._const).reshape(len(self._names), -1)
-        q = c.join(z[:, :ny], z[:, ny:])
-        at = Places.of(self._t.robot, q, self._travel, self._phase, self._aside)
-        return self._margins.bodies.placed(at)
+        q = c.join(z[:, :ny], z[:, ny:-3])
+        return self._margins.bodies.placed(Places.of(self._t.robot, q, self._phase, z[:, -3:]))
 
     def _gaps_at(
         self, at: Placed, directions: Array, before: tuple[Placed, Looked] | None, within: float = TRIGGER
@@ -353,9 +342,6 @@ LOST_BETWEEN_NODES, LOST_AT_NODES = 0.5, 0.25
 MAX_RAISE = 0.02  # [m] of the clearance required at a node, in one round
 # [m] only pieces of a pair that are nearer than its nearest two plus this get a raised clearance
 RAISED_WITHIN = 0.01
-MAX_MOVED = 1e-3  # [m] of the target between a constraint and the solution, without another solve
-# Share of the objective that constraints with the target elsewhere may cost, without another solve.
-MAX_MISPLACED_COST = 0.01
 MIN_NODE_INTERVAL = 2e-3  # [s] between a new node and its neighbours
 END_FRACTION = 0.2  # of the interval of two nodes: a new one stays so far from either
 
@@ -402,7 +388,7 @@ def clearance_violations(
         reference = plan.coarse_missed_reference if missed else plan.coarse_reference
         motion = plan.motion(reference, step=COARSE_STEP, missed=missed)
         phase = np.where(missed, MISSED, motion.phase)
-        at = Places.of(t.robot, motion.q, motion.travel, phase, motion.aside)
+        at = Places.of(t.robot, motion.q, phase, motion.displacement)
         approaches += [
             (pair, _Approach(distance, float(motion.time[k]), missed))
             for k, pair, distance in _near(margins, at, share)
@@ -459,42 +445,6 @@ def _near(margins: Margins, at: Places, share: float) -> list[tuple[int, Pair, f
     return out
 
 
-def misplaced(t: Transcription, result: SolverResult) -> Constraints:
-    """Constraints that have the target's bodies elsewhere than a solution, with their places there; none if
-    these limit the objective by little.
-    """
-    # clearance constraints come last
-    multipliers = result.multipliers[len(result.multipliers) - len(t.clearance_constraints) :]
-    price = dict(zip(t.clearance_constraints, np.abs(multipliers).tolist(), strict=True))  # per metre
-    moved = _moved_constraints(t, node_placements(t, result.x))
-    cost = sum(price[key] * _moved_by(t, key, new) for key, new in moved.items())
-    return moved if cost > MAX_MISPLACED_COST * abs(result.objective) else {}
-
-
-def _moved_constraints(t: ContactProgram, nodes: NodePlacements) -> Constraints:
-    """Constraints that have their bodies more than `MAX_MOVED` from where they are at the nodes, with their
-    places there.
-    """
-    number = {name: k for k, name in enumerate(nodes.names)}
-    out = Constraints()
-    for key, held in t.clearance_constraints.items():
-        k = number[key.place]
-        aside = tuple(nodes.at.aside[k].tolist())
-        new = held._replace(travel=float(nodes.at.travel[k]), aside=aside)
-        if _moved_by(t, key, new) > MAX_MOVED:
-            out[key] = new
-    return out
-
-
-def _moved_by(t: ContactProgram, key: ClearanceKey, new: SeparatingDirection) -> float:
-    """Distance [m] of a constraint's other body from where a new one has it."""
-    if key.other >= 0:
-        return 0.0
-    body, normal = t.problem.bodies.world[-1 - key.other], t.problem.bodies.normal
-    places = (held.placed(body, normal).translation for held in (t.clearance_constraints[key], new))
-    return float(np.linalg.norm(np.subtract(*places)))
-
-
 class _RaisedClearances:
     """Constraints of a program with a larger required distance than they have."""
 
@@ -503,7 +453,6 @@ class _RaisedClearances:
         shapes = margins.bodies.shapes
         directions = np.zeros((len(nodes.names), len(shapes), 3))
         self._gaps = shapes.look(margins.bodies.placed(nodes.at), np.inf, directions, margins.wanted).gaps
-        self._moved = _moved_constraints(t, nodes)
 
     def add(self, adjacent: Sequence[int], pair: Pair, distance: float) -> None:
         """Raise the required clearance of two bodies at these nodes by what their distance [m] lacks."""
@@ -517,9 +466,7 @@ class _RaisedClearances:
             gaps = {key: float(self._gaps[k, index[key[1:]]]) for key in own}
             nearest = min(gaps.values(), default=0.0)
             for key, held in own.items():
-                if key in self._moved:
-                    self.constraints[key] = self._moved[key]
-                elif gaps[key] < nearest + RAISED_WITHIN:
+                if gaps[key] < nearest + RAISED_WITHIN:
                     raised = self.constraints.get(key, held).least_distance
                     least = max(held.least_distance, raised, nearest + missing)
                     self.constraints[ClearanceKey(*key)] = held._replace(least_distance=least)

@@ -15,10 +15,8 @@ from impactopt.errors import InputError
 from impactopt.planning.budget import Budget, touching, with_effort_of
 from impactopt.planning.clearance_constraints import (
     ClearanceViolations,
-    Constraints,
     Margins,
     clearance_violations,
-    misplaced,
     solve_with_clearance,
 )
 from impactopt.planning.contact_replay import ACCEPTABLE_WITHIN, SOLVED_WITHIN
@@ -137,11 +135,6 @@ class BetweenNodes:
         # If the coarse contact misses an event, its optimum is not near one of the finer program.
         missed = error is not None and error.missed
         if violated is None and nodes == t.nodes and elements is None:
-            # Long contacts move the target far, so it differs much between iterates.
-            moved = misplaced(t, outcome.result) if self._margins is not None and t.nodes.contact else {}
-            if moved:
-                self._rounds += 1
-                return _with_target_placed(outcome, moved)
             # Nothing is missing by the estimates: the replay may still differ, and ask for finer elements.
             # They cannot add a parting that the program does not plan.
             replay = outcome.at.replay if self._refined < _MESH_ROUNDS else None
@@ -198,18 +191,6 @@ class BetweenNodes:
         if outcome is not self._clear:
             return _MAX_ROUNDS
         return _ROUNDS if self._mesh else 0
-
-
-def _with_target_placed(outcome: Outcome[Transcription], moved: Constraints) -> Additions[Transcription]:
-    """The program with the target's bodies where its solution has them."""
-
-    def guesses() -> Iterator[Guess[Transcription]]:
-        t = outcome.program
-        new = t.with_clearance({**t.clearance_constraints, **moved})
-        yield Guess.mapped(new, t, outcome.result, barrier=_BARRIER_CLEARANCE, most=_ITERATIONS_WARM)
-
-    why = "the plan avoids the target where it is not: solving with it where the plan has it"
-    return Additions(name="the target placed anew", why=why, guesses=guesses(), without="")
 
 
 def _name(nodes: int, elements: Elements | None, raised: int, *, in_contact: bool) -> str:

@@ -100,7 +100,7 @@ def first_touch(plan: Plan) -> dict[str, float | None]:
     end = plan.contact_start
     time = end - np.arange(0.0, min(TOUCH_WINDOW, end), TOUCH_STEP)  # backward from contact
     q = plan.closed(plan.independent(0, time)[0][::-1])[::-1]  # legs follow continuously forward in time
-    at = Places.of(p.robot, q, plan.travel(time), np.zeros(len(time), dtype=np.intp))
+    at = Places.of(p.robot, q, np.zeros(len(time), dtype=np.intp), plan.displacement(time))
     distance = np.array([min(bodies.exact(at, k, pair) for pair in pairs) for k in range(len(time))])
     clear = np.flatnonzero(distance > 0)
     # the last instant that still touches, going back from contact; 0 if bodies are clear there
@@ -350,7 +350,7 @@ class Solution(Solved):
         for missed in (False, True) if self.plan.abort is not None else (False,):
             motion = self.plan.motion(self.missed_trajectory if missed else self.trajectory, missed=missed)
             phase = np.where(missed, MISSED, motion.phase)
-            at = Places.of(problem.robot, motion.q, motion.travel, phase, motion.aside)
+            at = Places.of(problem.robot, motion.q, phase, motion.displacement)
             found = bodies.survey(motion.time, at)
             if found.clearance < least:
                 least, nearest = found.clearance, " and ".join(found.nearest)

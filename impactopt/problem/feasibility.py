@@ -233,7 +233,7 @@ def blocked(problem: ImpactProblem) -> list[str]:
         return []
     found = list[Touch]()
     for q in _postures_at_hit(problem):
-        at = Places.of(problem.robot, q[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+        at = Places.of(problem.robot, q[None], np.zeros(1, dtype=np.intp))
         touches = bodies.survey(np.zeros(1), at).touches
         if not touches or touches[0].depth < BLOCKED_DEPTH:
             return []

@@ -544,7 +544,6 @@ class ImpactProblem:
             self.robot,
             self.world,
             self.start_posture,
-            normal=self.normal,
             striking=tuple(joints[: len(strikers)]),
             strict=self.keep_out.enabled,
             standing=tuple(joints[len(strikers) :]),

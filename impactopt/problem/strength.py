@@ -364,9 +364,8 @@ def random_postures(robot: Robot, striker: str, q: Array, count: int, seed: int 
 
 def touches(problem: ImpactProblem, *postures: Array) -> bool:
     """True if bodies touch in one of these configurations (nq,), with the target as before contact."""
-    none: Array = np.zeros(len(postures))
-    at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))
-    return bool(problem.bodies.survey(none + np.arange(len(postures)), at).touches)
+    at = Places.of(problem.robot, np.array(postures), np.zeros(len(postures), dtype=np.intp))
+    return bool(problem.bodies.survey(np.arange(float(len(postures))), at).touches)
 
 
 def best_share(problem: ImpactProblem) -> tuple[float, EstimatedImpact] | None:

@@ -98,8 +98,8 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation, distance: flo
     chosen = _sampled(time, simulation.q, simulation.target_travel)
     phase = np.full(len(time), MISSED) if simulation.missed else simulation.phase()
     bodies = problem.bodies.with_target_moved(distance * problem.normal)
-    travel, aside = simulation.target_travel[chosen], simulation.aside()[chosen]
-    at = Places.of(problem.robot, simulation.q[chosen], travel, phase[chosen], aside)
+    moved = np.outer(simulation.target_travel, problem.normal) + simulation.aside()
+    at = Places.of(problem.robot, simulation.q[chosen], phase[chosen], moved[chosen])
     survey = bodies.survey(time[chosen], at)
     touched = simulation.touched
     if simulation.fall is None or not problem.keeps_apart:  # the engine had no solids that collide

@@ -119,7 +119,8 @@ class Builder:
     ny, nl, nw : number of coordinates, of the constrained legs' joints, of sole wrenches' components.
     y0 (ny,), legs0 (nl,) : posture of the stance; the start posture if no sole has stepped.
     layout, constraints, blocks : variables, constraints and blocks so far.
-    lifted : variables of :meth:`lift`, with the indices of the outputs that they equal.
+    lifted : variables that equal outputs of blocks, as those of :meth:`lift`; the indices of these outputs;
+        and the order of elimination among them: variables that others depend on have a larger number.
     followers : functions that :meth:`follow` has been given.
     """
 
@@ -131,7 +132,7 @@ class Builder:
         self.y0, self.legs0 = coordinates.start, coordinates.start_legs
         self.layout, self.constraints = Layout(), Constraints()
         self.blocks: list[Block] = []
-        self.lifted: list[tuple[Group, Index]] = []
+        self.lifted: list[tuple[Group, Index, int]] = []
         self.followers: list[Callable[[Builder], None]] = []
 
     def copy(self) -> Builder:
@@ -223,7 +224,7 @@ class Builder:
         )
         self.equal(term or name, place, labels, outputs, measure, affine=-group[0])
         # in the order of their making, as an output may depend on variables lifted before (`with_lifted`)
-        self.lifted.append((group, np.asarray(outputs, dtype=np.intp)))
+        self.lifted.append((group, np.asarray(outputs, dtype=np.intp), 0))
         return group
 
     def equal(

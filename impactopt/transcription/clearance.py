@@ -7,7 +7,7 @@ parameters. This module finds the chains, and adds blocks and constraints to a p
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -62,24 +62,32 @@ class Chain:
         # cached, as thousands of constraints have the same
         return np.concatenate([*map(_placement, self.placements), self.revolute])
 
-    def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Index, Index, Array]:
-        """z of a constraint as sums of coordinates: indices in z, indices in (y, legs), factors, (k,) each.
+    def pattern(self, c: StanceCoordinates, body: WorldBody | None = None) -> tuple[Index, Index, Array]:
+        """z of a constraint as sums: indices in z, indices in (y, legs, displacement), factors; (k,) each.
 
-        z = position of the base (3) in the axes of the other body; coordinates of the joints (n,).
+        z = position of the base, less the displacement of the target if the other body moves with it, in the
+        axes of the other body (3); coordinates of the joints (n,).
 
-        rotation : axes, as columns, of the world's body that the chain begins at.
+        body : of the world, that the chain begins at.
         """
         # Sums, as the base's position is turned into the other body's axes: R' p has three terms a component.
         # Links of one robot do not need it: the base moves both.
         index = _coordinate_indices(c)
         slots = [3 + k for k in range(len(self.columns))]
         coordinates, factors = [index[k] for k in self.columns], list(self.ratios)
-        if self.base and rotation is not None:
-            for i in range(3):
-                slots += [i] * 3
-                coordinates += [0, 1, 2]
-                factors += [float(rotation[j, i]) for j in range(3)]
+        if body is not None:
+            moved = c.ny + len(c.dependent)
+            for first, sign in ((0, float(self.base)), (moved, -float(body.moves))):
+                for i in range(3 if sign else 0):
+                    slots += [i] * 3
+                    coordinates += [first, first + 1, first + 2]
+                    factors += [sign * float(body.rotation[j, i]) for j in range(3)]
         return np.array(slots, dtype=np.intp), np.array(coordinates, dtype=np.intp), np.array(factors)
+
+
+def _placed(body: WorldBody) -> Any:
+    """Placement (pin.SE3) of a body of the world, which its target moves in z (`Chain.pattern`)."""
+    return pin.SE3(body.rotation, body.place)
 
 
 def _placement(m: Any) -> Array:
@@ -253,37 +261,33 @@ class SeparatingDirection(NamedTuple):
     vector (3) : unit vector from the other body to the link, in the other's frame. The maximization of the
         separation starts there.
     least_distance : [m].
-    travel [m], aside (3) [m] : of the target along its normal and across it, if the other body moves with it.
     """
 
     vector: tuple[float, ...]
     least_distance: float
-    travel: float = 0.0
-    aside: tuple[float, ...] = (0.0, 0.0, 0.0)
-
-    def placed(self, body: WorldBody, normal: Array) -> pin.SE3:
-        """Placement of the other body, for the target's normal (3,)."""
-        shift = self.travel * normal + np.array(self.aside)
-        return pin.SE3(body.rotation, body.place + shift * body.moves)
 
 
 def add_clearance_constraints(
     b: Builder,
     spots: Sequence[tuple[Place, list[Affine]]],
+    displacements: Sequence[Affine],
     constraints: Mapping[ClearanceKey, SeparatingDirection],
 ) -> list[ClearanceKey]:
     """Add blocks and constraints; returns the keys in the order of the program's constraints.
 
     spots : nodes of the program, with coordinates and legs.
+    displacements : of the target in the world (3,) [m] there.
     """
     if not constraints:
         return []
     bodies, shapes = b.problem.bodies, b.problem.bodies.shapes
     spot_of = {place.name: k for k, (place, _) in enumerate(spots)}
-    width = b.ny + b.nl
-    # All nodes' (y, legs) as one sparse matrix, of which a product with a selection takes the z of all
-    # constraints at once.
-    everywhere = stack([part for _, slots in spots for part in slots])
+    width = b.ny + b.nl + 3
+    # All nodes' (y, legs, displacement) as one sparse matrix, of which a product with a selection takes the z
+    # of all constraints at once.
+    everywhere = stack(
+        [part for (_, slots), moved in zip(spots, displacements, strict=True) for part in (*slots, moved)]
+    )
     coordinates, constants, radius = everywhere.matrix(b.layout.n), everywhere.const, shapes.radius.tolist()
     known: dict[tuple[int, int], _BodyPair] = {}
     groups: dict[int, _Group] = {}  # by number of joints: a block has one
@@ -292,12 +296,12 @@ def add_clearance_constraints(
         pair = key.joint, key.other
         if pair not in known:
             chain = _chain(b.robot, key.joint, max(key.other, 0))
-            pattern = chain.pattern(b.coordinates, None if body is None else body.rotation)
+            pattern = chain.pattern(b.coordinates, body)
             known[pair] = _BodyPair(chain, pattern, " and ".join(bodies.names(pair)))
         chain, pattern, name = known[pair]
         before = None
         if body is not None:
-            before = direction.placed(body, bodies.normal).inverse()  # distances are in the body's frame
+            before = _placed(body).inverse()  # distances are in the body's frame
         n = shapes.index[key.joint, key.other, key.number]
         group = groups.setdefault(len(chain.columns), _Group())
         group.keys.append(key)
@@ -320,7 +324,7 @@ def add_clearance_constraints(
         counts = [len(slots) for slots, _, _ in group.patterns]
         slots, columns, factors = (np.concatenate([p[k] for p in group.patterns]) for k in range(3))
         instance = np.repeat(np.arange(count), counts)
-        # rows of `coordinates`: (y, legs) of one node after the other, `width` each
+        # rows of `coordinates`: (y, legs, displacement) of one node after the other, `width` each
         at = np.repeat(group.spots, counts) * width + columns
         chosen = sp.csr_array((factors, (instance * size + slots, at)), shape=(count * size, len(constants)))
         of = Separations(
@@ -336,18 +340,20 @@ def add_clearance_constraints(
     return [key for group in groups.values() for key in group.keys]
 
 
-def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_array:
+def coupled(
+    matrix: Any, spots: Sequence[tuple[Place, list[Affine]]], displacements: Sequence[Affine]
+) -> sp.csc_array:
     """Matrix (n, n) with explicit zeros wherever clearance constraints may couple variables.
 
-    They couple the variables of the coordinates and legs at each node of ``spots``. So the structure of the
-    Hessian does not depend on which constraints there are.
+    They couple the variables of coordinates, legs and displacement at each node of ``spots``. So the
+    structure of the Hessian does not depend on which constraints there are.
     """
     own = sp.coo_array(matrix)
     rows, columns, values = [own.coords[0]], [own.coords[1]], [own.data]
-    for _, slots in spots:
+    for (_, slots), moved in zip(spots, displacements, strict=True):
         # a dense square of each node's variables: any pair of bodies may get a constraint there in a later
         # round
-        touched = np.unique(stack(slots).cols)
+        touched = np.unique(stack([*slots, moved]).cols)
         rows.append(np.repeat(touched, len(touched)))
         columns.append(np.tile(touched, len(touched)))
         values.append(np.zeros(len(touched) ** 2))
@@ -358,7 +364,7 @@ def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_
 def move_bodies(
     problem: ImpactProblem,
     blocks: Sequence[Block],
-    constraints: Mapping[ClearanceKey, SeparatingDirection],
+    constraints: Iterable[ClearanceKey],
 ) -> None:
     """Update the blocks of these constraints to a problem that has moved, but not rotated, bodies."""
     of_name = {block.name: block for block in blocks}
@@ -366,12 +372,11 @@ def move_bodies(
     # Constraints are in the order of `add_clearance_constraints`, so counting them by block finds the
     # instance.
     instance = dict.fromkeys(of_name, 0)
-    for key, direction in constraints.items():
+    for key in constraints:
         chain = _chain(problem.robot, key.joint, max(key.other, 0))
         name = f"apart{len(chain.columns)}"
         if key.other < 0:
-            body, normal = problem.bodies.world[-1 - key.other], problem.bodies.normal
-            at = direction.placed(body, normal)
+            at = _placed(problem.bodies.world[-1 - key.other])
             parameters[name][instance[name], :12] = _placement(at.inverse() * chain.placements[0])
         instance[name] += 1
     for name, block in of_name.items():

@@ -45,6 +45,7 @@ from impactopt.transcription.layout import (
     by_leg,
     determined,
     rates,
+    stack,
 )
 from impactopt.transcription.mesh import CollocationPoint
 from impactopt.transcription.motion_phase import add_cone_constraints
@@ -311,6 +312,27 @@ class Collision(ContactParameters):
     def target_state(self) -> Affine:
         """State of the target at separation."""
         return self.state[self.end[-1]]
+
+    def target_moved(self, i: int) -> tuple[Affine, Affine]:
+        """Duration T [s] of a stage's phase, and v of the target's displacement T v in this phase so far.
+
+        v : along the normal [m/s], and (3,) across it in the world if friction moves the target.
+        """
+        across = [self._integral(self.tangential, i)] if self.tangential.size else []
+        return self.T[self.stages[i].phase][0], stack([self.xt[i], *across])
+
+    def _integral(self, rate: Group, i: int) -> Affine:
+        """Integral of a rate over the phase so far at a stage, by Radau quadrature."""
+        s = self.stages[i]
+        begin = Affine.zeros(rate.size) if s.new_phase else self._integral(rate, s.previous)
+        return begin + sum(rate[m] * w for m, w in zip(s.members, s.quadrature, strict=True))
+
+    @property
+    def target_velocity(self) -> Affine:
+        """Velocity of the target after contact [m/s], in the directions of `target_moved`."""
+        last = self.end[-1]
+        along = self._slots(self.xt, last, Affine.zeros(1), each_phase=True)[1]
+        return stack([along, *([self.tangential[last]] if self.tangential.size else [])])
 
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of each block's instances, one a stage."""

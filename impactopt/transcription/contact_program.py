@@ -45,6 +45,7 @@ from impactopt.transcription.layout import (
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.springs import SpringPoint, add_hinges, add_springs
 from impactopt.transcription.structured import StructuredProgram
+from impactopt.transcription.target_displacement import TargetDisplacement
 
 Program = TypeVar("Program", bound="ContactProgram")
 
@@ -79,6 +80,7 @@ class ContactProgram(ABC):
     angular_momentum : after contact, a group of three variables, if it is in the objective.
     objectives : of the problem, as far as this program has them, with their quantities.
     clearance_constraints : clearance constraints, in the program's order; they are its last constraints.
+    displacements : of the target in the world (3,) [m], at each of `body_spots`.
     postures : of `strongest_posture` that are known, by seed; copies of the program share them.
     """
 
@@ -245,6 +247,9 @@ class ContactProgram(ABC):
                 self.constraints.measured(since, term.name, term.unit)
                 if not kind_of(term, Term).__module__.startswith("impactopt."):
                     self._check_own(type(term).__name__, since, before)
+        displacement = TargetDisplacement(self.builder, self.expected)
+        self.displacements = self._displacements(displacement)
+        displacement.add_constraints()
         # In the order of a problem file, as terms are.
         self.objectives = quantities(self, in_order(objectives, OBJECTIVES))
         self._objective = assemble(self.layout, self.objectives, self._prices())
@@ -276,7 +281,7 @@ class ContactProgram(ABC):
         objective, quadratic, linear = self._objective
         # one structure for all sets of clearance constraints, which solvers can reuse
         if self.clearance_constraints:
-            quadratic = coupled(quadratic, self.body_spots)
+            quadratic = coupled(quadratic, self.body_spots, self.displacements)
         return StructuredProgram(
             self.layout,
             self.blocks,
@@ -285,7 +290,10 @@ class ContactProgram(ABC):
             quadratic=quadratic,
             linear=linear,
             determined=by_choice(
-                [*(determined(Turn.LIFTED, g.index(0)) for g, _ in self.builder.lifted), *self._determined()]
+                [
+                    *(determined(Turn.LIFTED, g.index(0), step) for g, _, step in self.builder.lifted),
+                    *self._determined(),
+                ]
             ),
         )
 
@@ -296,7 +304,7 @@ class ContactProgram(ABC):
         constraints = {key: held for key, held in constraints.items() if key.place in places}
         other = copy.copy(self)
         other.builder = self._without_clearance.copy()
-        order = add_clearance_constraints(other.builder, self.body_spots, constraints)
+        order = add_clearance_constraints(other.builder, self.body_spots, self.displacements, constraints)
         other.clearance_constraints = {key: constraints[key] for key in order}
         other.program = other._assembled()
         return other
@@ -333,7 +341,7 @@ class ContactProgram(ABC):
     def with_lifted(self, x: Array) -> Array:
         """Variables (n,) with lifted ones set to the outputs of blocks that they equal; 0 for NaN and inf."""
         x = x.copy()
-        for group, outputs in self.builder.lifted:  # in order, as one may be a function of earlier ones
+        for group, outputs, _ in self.builder.lifted:  # in order, as one may be a function of earlier ones
             found = self.program.all_outputs(x)[outputs]
             group.write(x, np.where(np.isfinite(found), found, 0.0))
         return x
@@ -372,10 +380,8 @@ class ContactProgram(ABC):
         """Configurations at the nodes of `body_spots`, for solver variables (n,)."""
 
     @abstractmethod
-    def displacement(self, x: Array, time: Array) -> tuple[Array, Array]:
-        """Displacement (k,) of the target along its normal, and (k, 3) across it [m], at these times (k,) [s]
-        since the start.
-        """
+    def _displacements(self, target: TargetDisplacement) -> list[Affine]:
+        """Displacement of the target in the world (3,) [m], at each of `body_spots`."""
 
     @abstractmethod
     def decode(self, x: Array) -> Any:

@@ -63,6 +63,8 @@ class InstantImpact:
     w : impulsive sole wrenches [N s, N m s].
     """
 
+    phases = ()
+
     def __init__(self, b: Builder, contact: Contact, *, mass: float | None = None, prefix: str = "") -> None:
         self._b, self.contact, self._without_rebound = b, contact, mass is not None
         c = b.coordinates
@@ -88,6 +90,11 @@ class InstantImpact:
     def impulse(self) -> Affine:
         """Impulse to the target [N s]."""
         return self.impulse_group[0]
+
+    @property
+    def target_velocity(self) -> Affine:
+        """Velocity of the target along the normal after the impact [m/s]."""
+        return self.impulse_group[0] * (1 / self.mass) + self.speed_before
 
     @property
     def target_state(self) -> Affine:
@@ -471,7 +478,7 @@ class FrozenCollision(Collision):
             outputs = start + instance * size + part[name]
             measure = along(group.labels, "off") if name == "y" else Measure("m/s", 1.0, "off")
             b.equal("state to freeze at", group.name, group.labels, outputs, measure, affine=-group[0])
-            b.lifted.append((group, np.asarray(outputs, dtype=np.intp)))
+            b.lifted.append((group, np.asarray(outputs, dtype=np.intp), 0))
         for group, legs in zip(self.frozen_legs, self._legs_at, strict=True):
             b.equal(
                 "state to freeze at",

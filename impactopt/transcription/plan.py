@@ -280,14 +280,13 @@ class Motion:
     """Motion of the bodies at k instants.
 
     time (k,) [s].  phase (k,) : 0 before, 1 during, 2 after contact.  q (k, nq) : Pinocchio's configurations.
-    travel (k,), aside (k, 3) : displacement of the target along its normal and across it [m].
+    displacement (k, 3) : of the target [m].
     """
 
     time: Array = field(repr=False)
     phase: NDArray[np.intp] = field(repr=False)
     q: Array = field(repr=False)
-    travel: Array = field(repr=False)
-    aside: Array = field(repr=False)
+    displacement: Array = field(repr=False)
 
 
 def pushed_aside(time: Array, velocity: Array, since: Array) -> Array:
@@ -664,8 +663,7 @@ class Plan:
             time=time,
             phase=np.repeat([0, 1, 2], [before.sum(), len(within), after.sum()]),
             q=np.concatenate([reference.q[before], during, reference.q[after]]),
-            travel=np.zeros(len(time)) if missed else self.travel(time),
-            aside=np.zeros((len(time), 3)) if missed else self.aside(time),
+            displacement=np.zeros((len(time), 3)) if missed else self.displacement(time),
         )
 
     def in_contact(self, reference: Trajectory) -> Array:
@@ -707,6 +705,10 @@ class Plan:
     def aside(self, time: Array) -> Array:
         """Displacement (k, 3) [m] of the target across the normal at times (k,) [s], as of `travel`."""
         return self.collision.aside(np.asarray(time) - self.contact_start)
+
+    def displacement(self, time: Array) -> Array:
+        """Displacement (k, 3) [m] of the target at times (k,) [s], as of `travel`."""
+        return np.outer(self.travel(time), self.problem.normal) + self.aside(time)
 
     def stances(self) -> list[dict[str, Any]]:
         """Stance phases as in ``summary.json``; none if the problem has one stance.

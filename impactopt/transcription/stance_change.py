@@ -274,6 +274,15 @@ class PhaseSequence:
             out += [(place, posture_in(c, its, y, legs)) for place, (y, legs) in phase.spots()]
         return out
 
+    def times_from_contact(self) -> list[Affine]:
+        """Time [s] between contact and each of `spots`."""
+        out, blow = list[Affine](), self._b.problem.blow
+        for k, phase in self.stands.items():
+            between = range(k + 1, blow + 1) if k < blow else range(blow, k)
+            whole = sum(self.phases[j].T[0] for j in between)
+            out += [phase.T[0] * (1 - s if k < blow else s) + whole for s in phase.nodes]
+        return out
+
     def decode(self, x: Array) -> tuple[PlannedStand, ...]:
         """Solution of the phases without the impact, from solver variables (n,)."""
         out = []

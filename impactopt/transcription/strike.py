@@ -25,6 +25,7 @@ from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.motion_phase import add_nodes, at_node
 from impactopt.transcription.objective import Prices, wrench_prices
 from impactopt.transcription.plan import PlannedStrike, total_ground_wrench
+from impactopt.transcription.target_displacement import TargetDisplacement
 
 
 class StrikeTranscription(ContactProgram):
@@ -140,12 +141,9 @@ class StrikeTranscription(ContactProgram):
             for (place, slots), phase, time in zip(places, (0, 2), (0.0, end), strict=True)
         ]
 
-    def displacement(self, x: Array, time: Array) -> tuple[Array, Array]:
-        hit = self.decode(x).collision
-        # by the trapezoidal rule; the two states are at contact and at separation
-        displacement = float(np.diff(hit.time) @ (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)
-        after = np.asarray(time) > 0
-        return np.where(after, displacement, 0.0), hit.aside(np.where(after, hit.time[-1], 0.0))
+    def _displacements(self, target: TargetDisplacement) -> list[Affine]:
+        now = Affine.zeros(1)
+        return [target.before(now), *(target.after(now, place) for place, _ in self.follow_spots())]
 
     # ------------------------------------------------------------------ solution
     def decode(self, x: Array) -> PlannedStrike:

@@ -50,6 +50,7 @@ from impactopt.transcription.springs import (
 )
 from impactopt.transcription.stance_change import PhaseSequence
 from impactopt.transcription.structured import derivative_functions
+from impactopt.transcription.target_displacement import TargetDisplacement
 
 USER_PREFIX = "user_"  # of users' blocks in C, which has functions of its own, such as floor
 SECOND_BLOCKS = ("second_contact", "second_approach")
@@ -447,9 +448,20 @@ class Transcription(ContactProgram):
         expected = self.hit.expected
         return expected.spots() if isinstance(expected, Collision) else []
 
-    def displacement(self, x: Array, time: Array) -> tuple[Array, Array]:
-        plan = self.decode(x)
-        return plan.travel(time), plan.aside(time)
+    def _displacements(self, target: TargetDisplacement) -> list[Affine]:
+        swing, none = self.swing.T[0], Affine.zeros(3)
+        out = [target.before(swing * (1 - s)) for s in self.swing.nodes]
+        out += [target.in_contact(i, place) for i, (place, _) in enumerate(self._contact_spots)]
+        for follow in self.follows:
+            out += [
+                none if follow is self.abort else target.after(follow.T[0] * s, place)
+                for s, (place, _) in zip(follow.nodes, follow.spots(), strict=True)
+            ]
+        out += [target.before(T) for T in self.before.times_from_contact()]
+        after, *missed = self.after
+        spots = zip(after.times_from_contact(), after.spots(), strict=True)
+        out += [target.after(T, place) for T, (place, _) in spots]
+        return out + [none for sequence in missed for _ in sequence.spots()]
 
     def decode(self, x: Array) -> Plan:
         """The plan of solver variables x (n,)."""

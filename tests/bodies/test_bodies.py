@@ -243,7 +243,7 @@ def random_places(problem: ImpactProblem, count: int) -> Places:
         else:
             q.append(pin.randomConfiguration(robot.model, low, high))
     phase = rng.integers(0, 3, count)
-    return Places.of(robot, np.array(q), 0.01 * (phase == 2), phase)
+    return Places.of(robot, np.array(q), phase, np.outer(0.01 * (phase == 2), problem.normal))
 
 
 @pytest.mark.parametrize("name", scenes())
@@ -304,14 +304,14 @@ def test_the_nearest_of_all_is_the_nearest(name: str) -> None:
 def test_far_from_all_nothing_is_near() -> None:
     problem = dataclasses.replace(arm_problem(), body=TargetBody(shape="none"))
     bodies = problem.bodies
-    start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1, dtype=np.intp))
     assert bodies.survey(np.zeros(1), start, within=1e-3) == (FAR, 0.0, (), ())
 
 
 def test_what_touches_in_the_start_posture_may_touch() -> None:
     problem = load_problem("punch")
     bodies = problem.bodies
-    start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1, dtype=np.intp))
     assert bodies.survey(np.zeros(1), start).touches == ()
     assert min(bodies.exact(start, 0, pair) for pair in all_pairs(bodies, start, 0)) > 0
     model = problem.robot.model
@@ -376,7 +376,8 @@ def test_the_target_comes_goes_and_moves() -> None:
     problem = dataclasses.replace(arm_problem(), target=Board(mass=0.3, stiffness=1e5, breaking_force=900.0))
     bodies = problem.bodies
     q = np.tile(problem.start_posture, (4, 1))
-    places = Places.of(problem.robot, q, np.array([0.0, 0.0, 0.2, 0.0]), np.array([0, 1, 2, MISSED]))
+    moved = np.outer([0.0, 0.0, 1.0, 0.0], [0.2, 0.1, -0.3])
+    places = Places.of(problem.robot, q, np.array([0, 1, 2, MISSED]), moved)
     there = {body.name: bodies.present(body, places).tolist() for body in bodies.world}
     assert "ground" not in there, "the base is fixed"
     assert there["target"] == [True, False, False, False], "a board is broken"
@@ -384,12 +385,9 @@ def test_the_target_comes_goes_and_moves() -> None:
     free = arm_problem().bodies
     w = next(k for k, body in enumerate(free.world) if body.name == "target")
     (_, before), (_, after) = (free.placement(places, k, -1 - w) for k in (0, 2))
-    np.testing.assert_allclose(after - before, 0.2 * free.normal, atol=1e-12)
+    np.testing.assert_allclose(after - before, moved[2], atol=1e-12)
+    np.testing.assert_allclose(free.placed(places).world[2, w, 9:] - before, moved[2], atol=1e-12)
     assert free.present(free.world[w], places).tolist() == [True, True, True, False]
-    across = np.outer([0.0, 0.0, 1.0, 0.0], [0.0, 0.1, -0.3])
-    pushed = Places.of(problem.robot, q, places.travel, places.phase, across)
-    np.testing.assert_allclose(free.placement(pushed, 2, -1 - w)[1] - after, across[2], atol=1e-12)
-    np.testing.assert_allclose(free.placed(pushed).world[2, w, 9:] - after, across[2], atol=1e-12)
 
 
 # ---- the world
@@ -514,12 +512,12 @@ def test_a_foot_without_load_that_is_on_the_ground_at_the_start_sinks_no_deeper(
 
     bodies = dataclasses.replace(problem, start=foot_at(-0.001)).bodies
     for height, depth in ((-0.001, None), (-0.003, None), (-0.009, 0.005)):
-        places = Places.of(robot, foot_at(height)[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+        places = Places.of(robot, foot_at(height)[None], np.zeros(1, dtype=np.intp))
         touches = bodies.survey(np.zeros(1), places).touches
         assert [(t.one, t.other) for t in touches] == ([("right_ankle_roll", "ground")] if depth else [])
         assert [t.depth for t in touches] == pytest.approx([depth] if depth else [], abs=1e-5)
     # its clearance from the ground is none, whatever it may sink
-    places = Places.of(robot, foot_at(-0.003)[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    places = Places.of(robot, foot_at(-0.003)[None], np.zeros(1, dtype=np.intp))
     survey = bodies.survey(np.zeros(1), places)
     assert survey.nearest and "ground" not in survey.nearest
     # nor does it collide with it in MuJoCo, where its sole does

@@ -27,19 +27,23 @@ def apart_pieces(
     problem: ImpactProblem,
     robot: RobotMotion,
     postures: Mapping[str, Callable[[Variables], Array]],
+    moved: Mapping[str, Callable[[Variables], Array]],
     rows: Sequence[Mapping[str, Any]],
 ) -> tuple[list[Piece], list[str]]:
     """The constraints that a result says it had, in its order; and what is not known of them.
 
-    postures (nq,) : at all nodes, by their places.  rows : place, joint, other and number, vector,
-    least_distance [m] and travel [m], as `impactopt.transcription.clearance` has them.
+    postures (nq,), moved (3,) [m] : configuration, and displacement of the target, at all nodes, by their
+    places.  rows : place, joint, other and number, vector and least_distance [m], as
+    `impactopt.transcription.clearance` has them.
     """
     known: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
         known.setdefault(str(row["place"]), []).append(row)
     missing = [f"rows between bodies at {place!r}" for place in known if place not in postures]
     pieces = [
-        _piece(problem, robot, place, postures[place], at) for place, at in known.items() if place in postures
+        _piece(problem, robot, place, postures[place], moved[place], at)
+        for place, at in known.items()
+        if place in postures
     ]
     return pieces, missing
 
@@ -107,6 +111,7 @@ def _piece(
     robot: RobotMotion,
     place: str,
     posture: Callable[[Variables], Array],
+    moved: Callable[[Variables], Array],
     at: Sequence[Mapping[str, Any]],
 ) -> Piece:
     """All constraints at a place."""
@@ -122,9 +127,9 @@ def _piece(
     # frames: those of joints, and behind them one for each row whose other body is the world's
     joints = sorted({joint for joint, _, _ in flat} | {other for _, other, _ in flat if other >= 0})
     index = {joint: k for k, joint in enumerate(joints)}
-    turns, shifts = list[Array](), list[Array]()
+    turns, shifts, moves = list[Array](), list[Array](), list[bool]()
     first, second = list[int](), list[int]()
-    for joint, other, row in flat:
+    for joint, other, _ in flat:
         first.append(index[joint])
         if other >= 0:
             second.append(index[other])
@@ -132,14 +137,15 @@ def _piece(
         body = bodies.world[-1 - other]
         second.append(len(joints) + len(turns))
         turns.append(np.asarray(body.rotation))
-        shift = float(row["travel"]) * bodies.normal + np.array(row.get("aside", np.zeros(3)))
-        shifts.append(body.place + shift * body.moves)
+        shifts.append(body.place)
+        moves.append(body.moves)
 
     def value(v: Variables) -> Array:
         pin.forwardKinematics(robot.model, robot.data, posture(v))
         placed = [robot.data.oMi[joint] for joint in joints]
         turn = np.array([*(at.rotation for at in placed), *turns])
-        shift = np.array([*(at.translation for at in placed), *shifts])
+        world = [place + moved(v) * k for place, k in zip(shifts, moves, strict=True)]
+        shift = np.array([*(at.translation for at in placed), *world])
         back = turn[second].transpose(0, 2, 1)
         apart = np.einsum("kij,kj->ki", back, shift[first] - shift[second])
         found, ways[...] = _distances(one, two, back @ turn[first], apart, ways)

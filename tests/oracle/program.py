@@ -144,7 +144,9 @@ class Program:
         self._reference_range()
         self._first_touch()
         self._ground_force()
-        found, strange = apart_pieces(problem, self.robot, self._postures(), claims.apart)
+        found, strange = apart_pieces(
+            problem, self.robot, self._postures(), self._displacements(), claims.apart
+        )
         self.rows += found
         self.missing += strange
         self.rows += orientation_pieces(problem, self.robot, self.at_contact)
@@ -268,6 +270,76 @@ class Program:
             for way in (*self.ways, *self.stands)
             for k, s in enumerate(way.nodes)
         } | {self.blows[0].place(i): partial(in_contact, i) for i in range(self._stages)}
+
+    def _displacements(self) -> dict[str, Callable[[Variables], Array]]:
+        """Displacement (3,) [m] of the target at each node of all phases, by its place; adds its rows."""
+        p, term = self.problem, "displacement of the target"
+        moves = p.keeps_apart and any(body.moves for body in p.bodies.world)
+        rubbed = p.friction is not None and p.friction.moves_target
+        labels = ["along the normal", *(f"across it, {x}" for x in "xyz" if rubbed)]
+        axes = np.column_stack([p.normal, *(np.eye(3) if rubbed else ())])
+        before, still = float(p.target.speed_before()) * moves * p.normal, np.zeros(len(labels))
+
+        def known(v: Variables, time: Callable[[Variables], float]) -> Array:
+            return -before * time(v)
+
+        out: dict[str, Callable[[Variables], Array]] = {
+            place: partial(known, time=time) for place, time in self._since(0)
+        }
+        others = [*self._since(1), *(self._since(2) if len(self.courses) > 2 else ())]
+        out |= {place: lambda v: np.zeros(3) for place, _ in others}
+        if not (self.blows and moves):
+            return out | {self.blows[0].place(i): out[others[0][0]] for i in range(self._stages)}
+        blow = self.blows[0]
+
+        def across(v: Variables, i: int) -> Array:
+            s = blow.stages[i]
+            begin = np.zeros(3) if s.begins else across(v, s.previous)
+            rates = (blow.get(v, "target tangential velocity", m) for m in s.members)
+            return begin + sum(w * rate for w, rate in zip(s.integral, rates, strict=True))
+
+        def within(v: Variables, i: int) -> Array:
+            mean = blow.get(v, "target travel", i)
+            mean = np.append(mean, across(v, i)) if rubbed else mean
+            return v.one(blow.durations[blow.stages[i].phase]) * mean
+
+        def last(v: Variables) -> Array:
+            rate = blow.slope(v, "target travel", blow.end[-1], np.zeros(1), anew=True)
+            return np.append(rate, blow.get(v, "target tangential velocity", -1)) if rubbed else rate
+
+        def add(place: str, value: Callable[[Variables], Array]) -> Callable[[Variables], Array]:
+            name = f"{term}, {place}"
+            rows: list[Any] = [(term, place, labels, 0.0, 0.0)]
+            self.rows.append(Piece.of(lambda v: value(v) - v.get(name), rows))
+            return lambda v: v.get(name)
+
+        ends: list[Callable[[Variables], Array]] = [lambda v: still]
+        for spell, i in zip(blow.spells, blow.end, strict=True):
+            ends.append(add(f"end of {spell.name}", lambda v, i=i, begin=ends[-1]: begin(v) + within(v, i)))
+        for i in range(self._stages):
+            begin = ends[blow.stages[i].phase]
+            found = add(blow.place(i), lambda v, i=i, begin=begin: begin(v) + within(v, i))
+            out[blow.place(i)] = lambda v, found=found: axes @ found(v)
+        for place, time in self._since(1):
+            found = ends[-1]
+            if not p.target.stays:
+                found = add(place, lambda v, time=time: ends[-1](v) + time(v) * last(v))
+            out[place] = lambda v, found=found: axes @ found(v)
+        return out
+
+    def _since(self, course: int) -> list[tuple[str, Callable[[Variables], float]]]:
+        """Place, and time [s] from it to contact or since contact, of each node of a course."""
+        blow, ways, out = self.problem.blow, self.courses[course], []
+        for k, way in ways.items():
+            between = [ways[j].T for j in (range(k + 1, blow + 1) if course == 0 else range(blow, k))]
+            for s in map(float, way.nodes):
+                part = 1 - s if course == 0 else s
+
+                def time(v: Variables, way: Way = way, part: float = part, names: Any = between) -> float:
+                    return part * v.one(way.T) + sum(v.one(name) for name in names)
+
+                out.append((way.place(s), time))
+        return out
 
     def _tendons(self) -> None:
         """Sums of joint angles in their ranges, at all nodes."""

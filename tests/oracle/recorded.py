@@ -317,7 +317,8 @@ def _bodies(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
             asides, drift = np.cumsum(steps[:, None] * (before + rates) / 2, axis=0), rates[-1]
         gone, across = stages[-1][3], asides[-1]
         travels, phases = np.array([s[3] for s in stages]), np.ones(len(stages), dtype=np.intp)
-        survey = bodies.survey(times, Places.of(p.problem.robot, postures, travels, phases, asides))
+        shifts = np.outer(travels, p.problem.normal) + asides
+        survey = bodies.survey(times, Places.of(p.problem.robot, postures, phases, shifts))
         yield Off("distance of bodies", max(-survey.clearance, 0.0), " and ".join(survey.nearest))
         state = blow.get(v, "target state", blow.end[-1])
         speed = float(p.problem.target.velocity(state, blow.target))
@@ -332,11 +333,11 @@ def _bodies(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
             (np.asarray(arrays["missed_time"])[after], postures, np.full(len(postures), MISSED), MISSED)
         )
     for times, postures, phases, n in parts:
-        travel, aside = np.zeros(len(times)), np.zeros((len(times), 3))
+        shifts = np.zeros((len(times), 3))
         if n == 2:
             since = times - float(arrays["reference_contact_end"])
-            travel, aside = gone + speed * since, across + np.outer(since, drift)
-        at = Places.of(p.problem.robot, postures, travel, phases, aside)
+            shifts = np.outer(gone + speed * since, p.problem.normal) + across + np.outer(since, drift)
+        at = Places.of(p.problem.robot, postures, phases, shifts)
         survey = bodies.survey(times, at)
         where = f"{' and '.join(survey.nearest)} at {survey.time:.4g} s"
         yield Off("distance of bodies", max(-survey.clearance, 0.0), where)

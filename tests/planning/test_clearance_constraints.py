@@ -35,7 +35,6 @@ from impactopt.planning.clearance_constraints import (
     Margins,
     Watch,
     clearance_violations,
-    misplaced,
     node_placements,
     same_bodies,
 )
@@ -87,7 +86,7 @@ def test_starts_with_other_links_on_the_ground_have_other_bodies() -> None:
     def on_ground(start: list[float]) -> tuple[ImpactProblem, list[str]]:
         def above(floor: float) -> tuple[ImpactProblem, dict[str, float]]:
             there = dataclasses.replace(problem, start=start, ground=Ground(height=floor))
-            at = Places.of(problem.robot, np.array([start]), np.zeros(1), np.zeros(1, dtype=np.intp))
+            at = Places.of(problem.robot, np.array([start]), np.zeros(1, dtype=np.intp))
             bodies = there.bodies
             return there, {bodies.links.name(j): bodies.exact(at, 0, (j, -1)) for j in bodies.links.joints}
 
@@ -121,69 +120,16 @@ def test_bodies_that_are_near_at_the_start_may_not_penetrate_more_than_their_rou
         margins = Margins(dataclasses.replace(problem, obstacles=(wall,)))
         bodies = margins.bodies
         (number,) = [-1 - k for k, body in enumerate(bodies.world) if body.name == "wall"]
-        at = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+        at = Places.of(problem.robot, problem.start_posture[None], np.zeros(1, dtype=np.intp))
         return margins, min(bodies.exact(at, 0, (joint, number)) for joint in bodies.links.joints)
 
     margins, distance = beside(1.0 - beside(1.0)[1] + 1e-3)
     assert distance == pytest.approx(1e-3, abs=1e-6)
     shapes, none = margins.bodies.shapes, np.zeros((1, len(margins.bodies.shapes), 3))
-    at = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    at = Places.of(problem.robot, problem.start_posture[None], np.zeros(1, dtype=np.intp))
     found = shapes.look(margins.bodies.placed(at), 0.1, none, margins.wanted)
     gap, required = found.gap.min(), margins.pieces[found.pair[found.gap.argmin()]]
     assert gap < 0 and gap - distance < required < gap
-
-
-def test_the_clearance_of_what_stays_is_raised_wherever_the_target_was(free: Solution) -> None:
-    """Constraints on a peg were placed anew with the target, which does not move it, and so not raised."""
-    time = free.plan.swing_nodes[-4] * free.plan.swing.duration
-    x, _, z = hammer(free, time)
-    problem = with_peg(free.problem, x, z)
-    margins, t = Margins(problem), program_of(free, problem)
-    (peg,) = [-1 - k for k, body in enumerate(margins.bodies.world) if body.name == "peg"]
-    rows = Watch(t, margins, free.result.x).constraints()
-    t = t.with_clearance({key: held._replace(travel=held.travel - 0.05) for key, held in rows.items()})
-    violated = clearance_violations(Evaluation(t, free.result.x), margins)
-    assert violated is not None
-    raised = [key for key in violated.constraints if key.other == peg]
-    assert raised
-    assert all(violated.constraints[key].least_distance > rows[key].least_distance for key in raised)
-
-
-@pytest.mark.parametrize("way", ["along", "across"])
-def test_a_target_that_constraints_have_elsewhere_is_placed_anew(free: Solution, way: str) -> None:
-    """Only if these constraints matter; the other bodies stay where they are."""
-    margins, t = Margins(free.problem), program_of(free, free.problem)
-    rows = Watch(t, margins, free.result.x).constraints(0.5)
-    moving = {key for key in rows if key.other < 0 and margins.bodies.world[-1 - key.other].moves}
-    assert moving and moving != set(rows)
-    changed = {"travel": -0.05} if way == "along" else {"aside": (0.0, 0.05, 0.0)}
-    elsewhere = t.with_clearance({key: held._replace(**changed) for key, held in rows.items()})
-    others = np.zeros(t.program.m - len(t.clearance_constraints))
-    for price in (0.0, 1.0):
-        multipliers = np.append(others, np.full(len(rows), price))
-        found = misplaced(elsewhere, dataclasses.replace(free.result, multipliers=multipliers))
-        assert set(found) == (moving if price else set())
-        for key, held in found.items():
-            assert (held.travel, held.aside) == (rows[key].travel, rows[key].aside)
-
-
-def test_a_plan_with_nodes_in_contact_is_solved_with_the_target_where_it_has_it(free: Solution) -> None:
-    """G1 kept off places that a box of 40 kg had left, and shoved it with 45 N s instead of 51."""
-    old, margins = program_of(free, free.problem), Margins(free.problem)
-    t = Transcription(free.problem, block_functions(free.problem), free.nodes._replace(contact=True))
-    x = warm_start(t, old, free.result.x, np.zeros(old.program.m), np.zeros(old.layout.n))[0]
-    rows = Watch(t, margins, x).constraints(0.5)
-    t = t.with_clearance({key: held._replace(travel=held.travel - 0.05) for key, held in rows.items()})
-    zeros = np.zeros(len(x))
-    result = dataclasses.replace(free.result, x=x, multipliers=np.ones(t.program.m), bound_multipliers=zeros)
-    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None).started()
-    lacks = BetweenNodes(budget, margins).missing(Outcome.of(t, result))
-    assert lacks is not None
-    (guess,) = lacks.guesses
-    moving = [key for key in rows if key.other < 0 and margins.bodies.world[-1 - key.other].moves]
-    assert moving
-    for key in moving:
-        assert guess.program.clearance_constraints[key].travel == rows[key].travel
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def test_distances_and_replays_have_the_floor_at_its_height(height: float) -> No
         ground=Ground(height=height),
     )
     model, bodies, q = problem.robot.model, problem.bodies, problem.start_posture
-    at = Places.of(problem.robot, q[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    at = Places.of(problem.robot, q[None], np.zeros(1, dtype=np.intp))
     data = model.createData()
     pin.forwardKinematics(model, data, q)
     over = [j for j, w in bodies.world_pairs if problem.world[w].ground]

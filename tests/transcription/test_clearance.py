@@ -34,6 +34,7 @@ from impactopt import (
 from impactopt.bodies import separation
 from impactopt.bodies.clearance import Places
 from impactopt.bodies.separation import ROUNDING, THIN
+from impactopt.bodies.world import WorldBody
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import (
@@ -79,20 +80,20 @@ class Posed:
 
     robot: Robot
     c: StanceCoordinates
-    both: Array  # y, and legs behind them
+    both: Array  # y, legs, and the displacement of the target (3,) behind them
     data: Any
 
     @classmethod
     def at_random(cls, robot: Robot, posture: str, soles: tuple[str, ...], seed: int) -> Posed:
         c = StanceCoordinates(robot, tuple(robot.sole(s) for s in soles), robot.posture(posture))
-        both = np.random.default_rng(seed).uniform(-1.2, 1.2, c.ny + c.nl)
+        both = np.random.default_rng(seed).uniform(-1.2, 1.2, c.ny + c.nl + 3)
         data = robot.model.createData()
-        pin.forwardKinematics(robot.model, data, c.join(both[: c.ny], both[c.ny :]))
+        pin.forwardKinematics(robot.model, data, c.join(both[: c.ny], both[c.ny : -3]))
         return cls(robot, c, both, data)
 
-    def z(self, chain: Chain, rotation: Array | None) -> Array:
+    def z(self, chain: Chain, body: WorldBody | None) -> Array:
         out = np.zeros(3 + len(chain.columns))
-        slots, columns, factors = chain.pattern(self.c, rotation)
+        slots, columns, factors = chain.pattern(self.c, body)
         np.add.at(out, slots, factors * self.both[columns])
         return out
 
@@ -123,13 +124,21 @@ def test_a_chain_takes_a_point_to_where_pinocchio_does(name: str) -> None:
         pairs += [(posed.joint(rng), 1), (1, posed.joint(rng))]
         worlds = [(posed.joint(rng), 0) for _ in range(3)] + [(1, 0)]
         for one, other in (*((a, b) for a, b in pairs if a != b), *worlds):
-            centre, body = rng.uniform(-0.3, 0.3, 3), pin.SE3.Random()
+            centre, place = rng.uniform(-0.3, 0.3, 3), pin.SE3.Random()
+            body = WorldBody(
+                name="body",
+                half=np.ones(3),
+                place=place.translation,
+                rotation=place.rotation,
+                moves=bool(seed % 2),
+            )
             chain = chain_between(robot.model, one, other)
             assert chain.base == (robot.floating and other == 0)
             if other:
                 z, before, frame = posed.z(chain, None), None, posed.data.oMi[other]
             else:
-                z, before, frame = posed.z(chain, body.rotation), body.inverse(), body
+                z, before = posed.z(chain, body), place.inverse()
+                frame = pin.SE3(place.rotation, place.translation + posed.both[-3:] * body.moves)
             there = frame.actInv(posed.data.oMi[one].act(centre))
             np.testing.assert_allclose(taken(chain, z, chain.parameters(before), centre), there, atol=1e-9)
 
@@ -189,10 +198,6 @@ def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any,
         k = spots.names.index(row.place)
         one, two = pieces(bodies, row)
         at = [coal.Transform3s(*bodies.placement(spots.at, k, body)) for body in (row.joint, row.other)]
-        if row.other < 0:  # they know where the target was when they were made
-            body = bodies.world[-1 - row.other]
-            place = held.placed(body, bodies.normal)
-            at[1] = coal.Transform3s(place.rotation, place.translation)
         apart = coal.distance(one, at[0], two, at[1], coal.DistanceRequest(), coal.DistanceResult())
         what = " and ".join(bodies.names((row.joint, row.other)))
         term = SelfCollision.name if row.other >= 0 else KeepOut.name
@@ -250,7 +255,7 @@ def without(t: Transcription) -> Transcription:
 def test_margins_are_less_where_bodies_are_near_at_the_start(arm_transcription: Transcription) -> None:
     problem = arm_transcription.problem
     margins, bodies = margins_of(arm_transcription, (SelfCollision(margin=0.5), KeepOut())), problem.bodies
-    start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1, dtype=np.intp))
     for pair in bodies.pairs:
         apart = bodies.exact(start, 0, pair)
         assert margins.of(pair) == pytest.approx(min(0.5, 0.25 * apart))
@@ -262,7 +267,7 @@ def test_constraints_are_met_at_the_start(biped_transcription: Transcription) ->
     """Its back stands 2 mm before a wall, which is less than rounding takes."""
     free = biped_transcription.problem
     root = free.robot.model.getJointId("root")
-    at = Places.of(free.robot, free.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    at = Places.of(free.robot, free.start_posture[None], np.zeros(1, dtype=np.intp))
     back = at.translation[0, root] + at.rotation[0, root] @ (-0.092 - 0.05, -0.01, 0.25)
     wall = Obstacle(name="wall", size=(0.1, 1.0, 0.1), position=tuple(back))
     t = changed(biped_transcription, obstacles=(wall,))
@@ -292,7 +297,8 @@ def test_gaps_are_bounded_by_how_far_bodies_have_moved(
 
     def placed(turns: Array, travel: float) -> Any:
         q = np.array([pin.integrate(model, problem.start_posture, turn) for turn in turns])
-        return bodies.placed(Places.of(problem.robot, q, np.full(20, travel), np.zeros(20, dtype=np.intp)))
+        moved = np.tile(travel * problem.normal, (20, 1))
+        return bodies.placed(Places.of(problem.robot, q, np.zeros(20, dtype=np.intp), moved))
 
     one, two = placed(0.0 * turns, 0.0), placed(turns, 0.03)
     directions = np.zeros((20, len(shapes), 3))
@@ -330,7 +336,7 @@ def passing(problem: ImpactProblem, plan: Plan) -> float:
     motion, data = plan.motion(plan.trajectory(step=4e-3)), robot.model.createData()
     least = np.inf
     pieces = bodies.links.of_joint
-    for q, travel in zip(motion.q, motion.travel, strict=True):
+    for q, moved in zip(motion.q, motion.displacement, strict=True):
         pin.forwardKinematics(robot.model, data, q)
         for a, b in bodies.pairs:
             for one in pieces[a]:
@@ -338,7 +344,7 @@ def passing(problem: ImpactProblem, plan: Plan) -> float:
                     least = min(least, _apart(one.shape, data.oMi[a], two.shape, data.oMi[b]))
         for j, w in bodies.world_pairs:
             body = bodies.world[w]
-            place = pin.SE3(body.rotation, body.place + travel * problem.normal * body.moves)
+            place = pin.SE3(body.rotation, body.place + moved * body.moves)
             for one in pieces[j]:
                 least = min(least, _apart(one.shape, data.oMi[j], body.shape, place))
     return least

@@ -199,8 +199,8 @@ def _hits_base(problem: ImpactProblem, impact: EstimatedImpact) -> bool:
     if not isinstance(problem.target, FreeMass):
         return False
     travel = np.arange(0.0, AFTER * impact.impulse / problem.target.mass, AFTER_STEP)
-    after = np.full(len(travel), 2)
-    at = Places.of(problem.robot, np.tile(impact.q, (len(travel), 1)), travel, after)
+    after, moved = np.full(len(travel), 2), np.outer(travel, problem.normal)
+    at = Places.of(problem.robot, np.tile(impact.q, (len(travel), 1)), after, moved)
     fixed = {piece.link for piece in bodies_of(problem.robot).pieces if piece.joint == 0}
     found = problem.bodies.survey(travel, at).touches
     return any("target" in (touch.one, touch.other) and {touch.one, touch.other} & fixed for touch in found)

@@ -1,0 +1,48 @@
+"""Tests of the target's displacement as variables of a program, against the plan's own integral."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from support.small_plans import arm_problem, transcribed
+
+from impactopt import ContactFriction, FreeMass, RigidWall, TargetBody, solve
+from impactopt.planning.clearance_constraints import node_placements
+from impactopt.planning.solution import program_of
+from impactopt.problem.terms import KeepOut, SelfCollision
+from impactopt.solvers.program import Status
+from impactopt.transcription.initial_guess import first_iterate
+from impactopt.transcription.target_displacement import TERM
+
+OFF = (KeepOut(enabled=False), SelfCollision(enabled=False))
+TARGETS: dict[str, dict[str, Any]] = {
+    "free": {},
+    "frozen model": {"collision": "sdc"},
+    "rigid": {"collision": "rigid"},
+    "pushed aside": {"friction": ContactFriction(coefficient=0.6, moves_target=True)},
+    "coming": {"target": FreeMass(mass=1.0, initial_velocity=-0.5)},
+}
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_solution_has_the_target_where_its_plan_has_it(name: str) -> None:
+    """Up to the trapezoidal rule of the plan's integral in contact."""
+    solution = solve(dataclasses.replace(arm_problem(), **TARGETS[name]))
+    assert solution.status is Status.SOLVED
+    t, x = program_of(solution), solution.result.x
+    nodes = node_placements(t, x)
+    moved = solution.plan.displacement(nodes.time)
+    assert np.abs(moved).max() > 1e-3
+    np.testing.assert_allclose(nodes.at.displacement, moved, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"target": RigidWall()}, {"body": TargetBody(shape="none")}, {"terms": OFF}]
+)
+def test_where_no_body_moves_with_the_target_there_are_no_such_variables(changes: dict[str, Any]) -> None:
+    t = transcribed(dataclasses.replace(arm_problem(), **changes))
+    assert not [name for name in t.layout.groups if name.startswith(TERM)]
+    assert not node_placements(t, first_iterate(t)).at.displacement.any()

@@ -223,7 +223,6 @@ class Builder:
             name, 1, size, lower=lower, upper=upper, scale=scale, labels=labels, measure=measure
         )
         self.equal(term or name, place, labels, outputs, measure, affine=-group[0])
-        # in the order of their making, as an output may depend on variables lifted before (`with_lifted`)
         self.lifted.append((group, np.asarray(outputs, dtype=np.intp), 0))
         return group
 

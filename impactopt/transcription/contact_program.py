@@ -341,9 +341,13 @@ class ContactProgram(ABC):
     def with_lifted(self, x: Array) -> Array:
         """Variables (n,) with lifted ones set to the outputs of blocks that they equal; 0 for NaN and inf."""
         x = x.copy()
-        for group, outputs, _ in self.builder.lifted:  # in order, as one may be a function of earlier ones
-            found = self.program.all_outputs(x)[outputs]
-            group.write(x, np.where(np.isfinite(found), found, 0.0))
+        # in rounds, as one may be a function of others
+        for _ in self.builder.lifted:
+            before, found = x.copy(), self.program.all_outputs(x)
+            for group, outputs, _ in self.builder.lifted:
+                group.write(x, np.where(np.isfinite(found[outputs]), found[outputs], 0.0))
+            if np.array_equal(x, before):
+                break
         return x
 
     # ------------------------------------------------------------------ for subclasses

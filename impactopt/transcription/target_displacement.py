@@ -18,6 +18,8 @@ from impactopt.transcription.frozen_collision import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group
 
 TERM = "displacement of the target"
+# [m] Unit of the variables. An error of an early step, of a metre, must not outweigh all other constraints.
+_UNIT = 10.0
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,10 @@ class _Sum:
         """Slots of the block ``link``, whose equation of position is base + T v for yf = 0."""
         zero, one, each = Affine.zeros(1), Affine.constant(1.0), range(self.group.size)
         parts = [(self.base[k : k + 1], self.v[k : k + 1]) for k in each]
-        return [[zero, zero, one, -y, zero, one, self.T, zero, -v, zero, zero, zero] for y, v in parts]
+        return [
+            [zero, zero, one, -y, zero, one, self.T, zero, -v * (1 / _UNIT), zero, zero, zero]
+            for y, v in parts
+        ]
 
 
 class TargetDisplacement:
@@ -50,13 +55,13 @@ class TargetDisplacement:
         self._moves = p.keeps_apart and any(body.moves for body in p.bodies.world)
         across = isinstance(hit, Collision) and hit.tangential.size > 0
         self._labels = ["along the normal", *(f"across it, {axis}" for axis in "xyz" * across)]
-        self._axes: Array = np.column_stack([p.normal, np.eye(3)[:, : 3 * across]])
+        self._axes: Array = _UNIT * np.column_stack([p.normal, np.eye(3)[:, : 3 * across]])
         self._ends: list[Affine] = []  # components at the ends of the contact's phases
 
     def before(self, remaining: Affine) -> Affine:
         """Displacement at this time [s] before contact."""
         speed = float(self._b.problem.target.speed_before()) if self._moves else 0.0
-        return remaining.apply(-speed * self._axes[:, :1])
+        return remaining.apply(-speed / _UNIT * self._axes[:, :1])
 
     def in_contact(self, stage: int, place: Place) -> Affine:
         """Displacement at a collocation point."""

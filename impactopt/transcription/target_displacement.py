@@ -88,7 +88,7 @@ class TargetDisplacement:
         outputs = b.add_block("link", instances, np.zeros(0)) + 3 * np.arange(len(instances))
         outputs = outputs.reshape(len(self._sums), -1) + b.parts("link")["position"]
         for each, at in zip(self._sums, outputs, strict=True):
-            far = millimetres("off")
+            far = millimetres("off", scale=_UNIT)
             b.equal(TERM, each.place, each.group.labels, at, far, affine=-each.group[0])
             b.lifted.append((each.group, at, each.step))
 

@@ -70,6 +70,8 @@ _KNOWN_TERMS = (
 )
 _KNOWN_OBJECTIVES = (Impulse, TargetEnergy, PeakForce, Penetration, AngularMomentum, Effort)
 
+UNIT = 10.0  # [m] of the displacements of the target, as variables
+
 
 @dataclass(frozen=True, kw_only=True)
 class Claims:
@@ -277,7 +279,7 @@ class Program:
         moves = p.keeps_apart and any(body.moves for body in p.bodies.world)
         rubbed = p.friction is not None and p.friction.moves_target
         labels = ["along the normal", *(f"across it, {x}" for x in "xyz" if rubbed)]
-        axes = np.column_stack([p.normal, *(np.eye(3) if rubbed else ())])
+        axes = UNIT * np.column_stack([p.normal, *(np.eye(3) if rubbed else ())])
         before, still = float(p.target.speed_before()) * moves * p.normal, np.zeros(len(labels))
 
         def known(v: Variables, time: Callable[[Variables], float]) -> Array:
@@ -301,7 +303,7 @@ class Program:
         def within(v: Variables, i: int) -> Array:
             mean = blow.get(v, "target travel", i)
             mean = np.append(mean, across(v, i)) if rubbed else mean
-            return v.one(blow.durations[blow.stages[i].phase]) * mean
+            return v.one(blow.durations[blow.stages[i].phase]) * mean / UNIT
 
         def last(v: Variables) -> Array:
             rate = blow.slope(v, "target travel", blow.end[-1], np.zeros(1), anew=True)
@@ -323,7 +325,7 @@ class Program:
         for place, time in self._since(1):
             found = ends[-1]
             if not p.target.stays:
-                found = add(place, lambda v, time=time: ends[-1](v) + time(v) * last(v))
+                found = add(place, lambda v, time=time: ends[-1](v) + time(v) * last(v) / UNIT)
             out[place] = lambda v, found=found: axes @ found(v)
         return out
 

@@ -142,8 +142,7 @@ class StrikeTranscription(ContactProgram):
         ]
 
     def _displacements(self, target: TargetDisplacement) -> list[Affine]:
-        now = Affine.zeros(1)
-        return [target.before(now), *(target.after(now, place) for place, _ in self.follow_spots())]
+        return [Affine.zeros(3), *(target.after(None, place) for place, _ in self.follow_spots())]
 
     # ------------------------------------------------------------------ solution
     def decode(self, x: Array) -> PlannedStrike:

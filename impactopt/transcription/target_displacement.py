@@ -70,12 +70,12 @@ class TargetDisplacement:
         base = self._end(self._hit.stages[stage].phase)
         return self._add(place, base, *self._hit.target_moved(stage)).apply(self._axes)
 
-    def after(self, since: Affine, place: Place) -> Affine:
-        """Displacement at this time [s] after contact."""
+    def after(self, since: Affine | None, place: Place) -> Affine:
+        """Displacement at this time [s] after contact; None: at its end."""
         if not self._moves:
             return Affine.zeros(3)
         base = self._end(len(self._hit.phases))
-        if not self._b.problem.target.stays:
+        if since is not None and not self._b.problem.target.stays:
             base = self._add(place, base, since, self._hit.target_velocity)
         return base.apply(self._axes)
 

@@ -454,7 +454,7 @@ class Transcription(ContactProgram):
         out += [target.in_contact(i, place) for i, (place, _) in enumerate(self._contact_spots)]
         for follow in self.follows:
             out += [
-                none if follow is self.abort else target.after(follow.T[0] * s, place)
+                none if follow is self.abort else target.after(follow.T[0] * s if s else None, place)
                 for s, (place, _) in zip(follow.nodes, follow.spots(), strict=True)
             ]
         out += [target.before(T) for T in self.before.times_from_contact()]

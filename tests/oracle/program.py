@@ -324,7 +324,7 @@ class Program:
             out[blow.place(i)] = lambda v, found=found: axes @ found(v)
         for place, time in self._since(1):
             found = ends[-1]
-            if not p.target.stays:
+            if not p.target.stays and place != self.ways[1].place(0.0):
                 found = add(place, lambda v, time=time: ends[-1](v) + time(v) * last(v) / UNIT)
             out[place] = lambda v, found=found: axes @ found(v)
         return out

@@ -244,7 +244,8 @@ def test_what_is_left_after_contact_can_be_balanced(biped_plan: Planned, solved:
 def embedded(plan: Planned) -> tuple[StrikeTranscription, Array]:
     """A motion's state at contact, and its collision, as a strike's variables."""
     t, x = plan.transcription, plan.result.x
-    strike = of_strike(t)
+    # that motion has no constraints between bodies
+    strike = of_strike(changed(t, terms=BODILESS))
     out = np.zeros(strike.program.n)
     for name, group in strike.layout.groups.items():
         if (mine := t.layout.groups.get(name)) is not None and mine.count == group.count:
@@ -269,7 +270,6 @@ def test_a_motions_state_at_contact_is_a_strike_and_the_strike_brings_more(
     assert off <= 10 * robot_plan.result.max_violation + 1e-5
     assert strike.impulse(x) == pytest.approx(robot_plan.plan.impulse)
     assert program.objective(x) <= robot_plan.result.objective + 1e-4, "its prices are no higher"
-    # that motion has no rows between bodies
     found = optimized(changed(robot_plan.transcription, terms=BODILESS), monkeypatch, start=x)
     assert found.impulse >= robot_plan.plan.impulse - 1e-3
     assert found.result.objective <= robot_plan.result.objective + 1e-3

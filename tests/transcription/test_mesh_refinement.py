@@ -239,7 +239,7 @@ def check_carried_over(old: Transcription) -> None:
     there, of_rows, of_bounds = warm_start(new, old, x, y, z)
     places = {"swing": (old.swing_nodes, new.swing_nodes)}
     places |= dict.fromkeys(("follow", "abort"), (old.follow_nodes, new.follow_nodes))
-    lifted = {group.name for group, _ in old.builder.lifted}
+    lifted = {group.name for group, *_ in old.builder.lifted}
     found = 0
     for name, group in old.layout.groups.items():
         mine = new.layout.groups[name]

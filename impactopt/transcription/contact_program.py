@@ -381,7 +381,7 @@ class ContactProgram(ABC):
 
     @abstractmethod
     def body_states(self, x: Array) -> list[BodyState]:
-        """Configurations at the nodes of `body_spots`, for solver variables (n,)."""
+        """Configurations at the nodes of `body_spots`, in their order, for solver variables (n,)."""
 
     @abstractmethod
     def _displacements(self, target: TargetDisplacement) -> list[Affine]:

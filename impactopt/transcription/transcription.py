@@ -417,9 +417,10 @@ class Transcription(ContactProgram):
                 BodyState(2 + missed, place.name, begin + s * curve.duration, self.posture(x, slots))
                 for s, (place, slots) in zip(nodes, follow.spots(), strict=True)
             ]
+        out += self._stand_states(x, self.before, plan.pieces(), 0)
         for missed, sequence in enumerate(self.after):
             out += self._stand_states(x, sequence, plan.pieces(missed=bool(missed)), 2 + missed)
-        return out + self._stand_states(x, self.before, plan.pieces(), 0)
+        return out
 
     def _stand_states(
         self, x: Array, sequence: PhaseSequence, pieces: list[Piece], phase: int

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.small_plans import arm_problem, transcribed
+from support.small_plans import arm_problem, biped_problem, transcribed
 
-from impactopt import ContactFriction, FreeMass, RigidWall, TargetBody, solve
+from impactopt import ContactFriction, FreeMass, Phase, RigidWall, Scenario, StancePhase, TargetBody, solve
+from impactopt.bodies.clearance import MISSED
 from impactopt.planning.clearance_constraints import node_placements
 from impactopt.planning.solution import program_of
 from impactopt.problem.terms import KeepOut, SelfCollision
@@ -37,6 +38,28 @@ def test_a_solution_has_the_target_where_its_plan_has_it(name: str) -> None:
     moved = solution.plan.displacement(nodes.time)
     assert np.abs(moved).max() > 1e-3
     np.testing.assert_allclose(nodes.at.displacement, moved, atol=1e-3)
+
+
+def test_the_target_moves_on_in_later_stance_phases_and_comes_in_earlier_ones() -> None:
+    both = StancePhase(soles=("left", "right"), phase=Phase(duration=0.5, intervals=6))
+    ball, left = FreeMass(mass=1.0, initial_velocity=-0.3), StancePhase(soles=("left",))
+    gone = Scenario(name="gone", missing=True, abort_after=0.02)
+    t = transcribed(
+        dataclasses.replace(
+            biped_problem(),
+            target=ball,
+            scenarios=(gone,),
+            stances=(both, left, both),
+        )
+    )
+    x = first_iterate(t)
+    nodes, plan = node_placements(t, x), t.decode(x)
+    assert nodes.names == tuple(place.name for place, _ in t.body_spots)
+    here = nodes.at.phase != MISSED
+    moved = plan.displacement(nodes.time[here])
+    assert moved[0] @ t.problem.normal > 0.1 and (moved @ t.problem.normal).max() > 0.5
+    np.testing.assert_allclose(nodes.at.displacement[here], moved, atol=0.02)
+    assert not nodes.at.displacement[~here].any()
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,7 @@ from impactopt.planning.lazy_constraints import (
     slide,
     slide_caution,
     touch_caution,
+    window_caution,
 )
 from impactopt.planning.refinement import Attempt, Outcome
 from impactopt.problem.feasibility import overlapping
@@ -492,7 +493,6 @@ def solution_of(
     statement: str,
     gains: tuple[ChosenGains, ...] = (),
     causes: tuple[Cause, ...] = (),
-    window: str = "",
     contact_error: ContactError | None = None,
 ) -> Solution:
     """The `Solution` of a refinement's outcome.
@@ -512,7 +512,7 @@ def solution_of(
         statement=statement,
         gains=gains,
         causes=causes,
-        window=window,
+        window=window_caution(t, outcome.result) if outcome.usable else "",
         contact_error=contact_error,
         plan=at.planned,
         nodes=t.nodes,

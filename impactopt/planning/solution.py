@@ -437,12 +437,13 @@ class Solution(Solved):
             out["simulated"] = simulation.summary(**known)
         if replay is not None:
             out["replayed"] = replay.report(**known)
-        replayed = [run.loads for run in (replay, simulation) if run is not None]
-        slides, again = slide_caution(self.problem, self.slide), touch_caution(self.problem, plan)
+        runs = [run for run in (replay, simulation) if run is not None]
+        slides = slide_caution(self.problem, self.slide)
+        again = touch_caution(self.problem, plan, runs[-1].impulse if runs else None)
         cautions = (out.get("caution"), again, slides, self.window, overlapping(self.problem))
         if caution := " ".join(filter(None, cautions)):
             out["caution"] = caution
-        return out | gear_caution(self.problem, [self.loads, *replayed])
+        return out | gear_caution(self.problem, [self.loads, *(run.loads for run in runs)])
 
 
 def impact_summary(

@@ -19,7 +19,7 @@ from scipy.integrate import cumulative_trapezoid, trapezoid
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
-from impactopt.errors import counted
+from impactopt.errors import InputError, counted
 from impactopt.planning.bounds import Cause
 from impactopt.planning.contact_replay import (
     ACCEPTABLE_WITHIN,
@@ -183,6 +183,10 @@ class Solved:
             f"{self.status.value}, {impulse:.2f} N s, {counted(self.result.iterations, 'iteration')}>"
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The version comes first in a pickle, as another one may not know what follows."""
+        return _of_version, (type(self), __version__), self.__dict__
+
     @property
     def model_error(self) -> ModelError | None:
         """Estimated error of the collision model; None if it freezes nothing."""
@@ -239,6 +243,16 @@ class Solved:
             "contact_replay_pct": None if self.contact_replay is None else self.contact_replay.impulse_pct,
             **({"caution": self.caution} if self.caution else {}),
         }
+
+
+def _of_version(kind: type[Solved], made_by: str) -> Solved:
+    """Solution without attributes, into which a pickle is read; InputError if another version wrote that."""
+    if made_by != __version__:
+        raise InputError(
+            f"this {kind.__name__} was pickled by impactopt {made_by}, and only that reads it; this is "
+            f"{__version__}. There, `save` it: other versions read that by load_solution"
+        )
+    return object.__new__(kind)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -97,6 +97,17 @@ def check_kind(name: str, given: object, kind: type) -> None:
     if not isinstance(given, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         raise InputError(f"{name} must be {article} {kind.__name__}, not {shortened(repr(given))}")
+
+
+def named_table(given: Any) -> Any:
+    """A pandas Series by names as a dict; anything else as it is.
+
+    As an array, it would count in its own order.
+    """
+    if isinstance(given, Mapping) or not hasattr(given, "keys") or getattr(given, "ndim", 0) != 1:
+        return given
+    table = dict(given.items())
+    return table if table and all(isinstance(name, str) for name in table) else given
 
 
 def missing_package(what: str, package: str, extra: str) -> InputError:

@@ -45,8 +45,15 @@ class RobotBodies:
 
     @cached_property
     def hash(self) -> str:
-        """Hexadecimal hash of the hulls, to the micrometre, in any order of links and vertices."""
-        hulls = sorted((p.link, sorted((np.round(1e6 * p.vertices) + 0.0).tolist())) for p in self.pieces)
+        """Hexadecimal hash of the hulls' extents in many directions, to the micrometre.
+
+        It does not depend on the order of links and vertices, nor on rounding: in which vertices a hull has,
+        of points that are nearly on its surface, Qhull's versions differ.
+        """
+        height, wide, turn = _lattice(np.pi)
+        directions = np.array([wide * np.cos(turn), wide * np.sin(turn), height])
+        extents = ((p.link, (1e6 * p.vertices @ directions).max(axis=0)) for p in self.pieces)
+        hulls = sorted((link, (np.round(extent) + 0.0).tolist()) for link, extent in extents)
         return hashlib.sha256(repr(hulls).encode()).hexdigest()[:16]
 
     @cached_property
@@ -186,9 +193,9 @@ def distance(one: Any, at_one: Any, two: Any, at_two: Any) -> float:
 _REQUEST = coal.DistanceRequest()
 
 
-# [rad] half angle, about the face's normal, of the directions in which corners may be the foremost; and their
-# number
-CONE, DIRECTIONS = np.pi / 3, 400
+# [rad] half angle, about the face's normal, of the directions in which corners may be the foremost
+CONE = np.pi / 3
+DIRECTIONS = 400  # of a lattice
 MERGED = 0.004  # [m] corners nearer to each other than this count as one
 FLAT = 0.9  # cosine of the largest angle between facets of one face
 
@@ -243,13 +250,20 @@ def striker_face(
     return StrikerFace(normal, _leading(away[hull.vertices], normal))
 
 
-def _leading(points: Array, normal: Array) -> Array:
-    """Points that are foremost in some direction of a cone about the normal, without near duplicates."""
-    # directions on a Fibonacci lattice, which covers the cone's cap evenly
+def _lattice(half_angle: float) -> tuple[Array, Array, Array]:
+    """Fibonacci lattice of unit vectors, which covers a cone's cap evenly.
+
+    Each vector's part along the cone's axis and across it, and its angle about the axis [rad].
+    """
     k = np.arange(DIRECTIONS) + 0.5
     # Heights in equal steps are rings of equal area (Archimedes); the golden angle spreads them around.
-    height, turn = 1 - (1 - np.cos(CONE)) * k / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
-    wide = np.sqrt(1 - height**2)
+    height, turn = 1 - (1 - np.cos(half_angle)) * k / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
+    return height, np.sqrt(1 - height**2), turn
+
+
+def _leading(points: Array, normal: Array) -> Array:
+    """Points that are foremost in some direction of a cone about the normal, without near duplicates."""
+    height, wide, turn = _lattice(CONE)
     across = np.linalg.svd(normal[None])[2][1:]
     directions = height[:, None] * normal + wide[:, None] * (
         np.cos(turn)[:, None] * across[0] + np.sin(turn)[:, None] * across[1]

@@ -267,7 +267,7 @@ _START = {
 }
 _PROBLEM = {
     **dict.fromkeys(
-        ("name?", "robot?", "striker?", "target?", "target_body?", "law?", "hash?", "shapes?", "collision?"),
+        ("name?", "robot?", "striker?", "target?", "target_body?", "law?", "hash?", "hulls?", "collision?"),
         _TEXT,
     ),
     **dict.fromkeys(("point_m?", "normal?"), ([(int, float)],)),

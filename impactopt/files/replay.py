@@ -135,7 +135,7 @@ def _may_be_of(record: Record, problem: ImpactProblem) -> bool:
     known = record.summary.get("problem", {})
     if known.get("hash") not in (None, problem.hash):
         return False
-    return "shapes" not in known or known["shapes"] == bodies_of(problem.robot).hash
+    return "hulls" not in known or known["hulls"] == bodies_of(problem.robot).hash
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

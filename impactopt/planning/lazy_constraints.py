@@ -129,10 +129,12 @@ def slide_caution(problem: ImpactProblem, length: float) -> str:
     )
 
 
-def touch_caution(problem: ImpactProblem, plan: Plan) -> str:
+def touch_caution(problem: ImpactProblem, plan: Plan, replayed: float | None = None) -> str:
     """Warning about a striking point that meets the target again in the follow-through, such as a slow target
     or one on a spring; "" without. Constraints keep it off a target that stays, or, with `TargetSpeed`, keeps
     its speed.
+
+    replayed : impulse [N s] of all touches in a replay, if there is one.
     """
     if problem.target.stays or not problem.lasts:
         return ""
@@ -151,9 +153,10 @@ def touch_caution(problem: ImpactProblem, plan: Plan) -> str:
         over_face = np.linalg.norm(offset @ across(problem.normal).T, axis=1) < FACE
         again = np.flatnonzero(over_face & (beyond > max(beyond[0], 0.0) + _MET))
         if again.size:
+            share = f": {replayed:.3g} N s in a replay, {plan.impulse:.3g} N s as planned" if replayed else ""
             return (
                 f"{striker} meets the target again {time[again[0]] - plan.contact_start:.2g} s after contact "
-                f"began, which the planned impulse leaves out; {remedy}."
+                f"began, which the planned impulse leaves out{share}; {remedy}."
             )
     return ""
 

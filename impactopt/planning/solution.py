@@ -19,7 +19,7 @@ from scipy.integrate import cumulative_trapezoid, trapezoid
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
-from impactopt.errors import counted
+from impactopt.errors import InputError, counted
 from impactopt.planning.bounds import Cause
 from impactopt.planning.contact_replay import (
     ACCEPTABLE_WITHIN,
@@ -35,6 +35,7 @@ from impactopt.planning.lazy_constraints import (
     slide,
     slide_caution,
     touch_caution,
+    window_caution,
 )
 from impactopt.planning.refinement import Attempt, Outcome
 from impactopt.problem.feasibility import overlapping
@@ -182,6 +183,10 @@ class Solved:
             f"{self.status.value}, {impulse:.2f} N s, {counted(self.result.iterations, 'iteration')}>"
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The version comes first in a pickle, as another one may not know what follows."""
+        return _of_version, (type(self), __version__), self.__dict__
+
     @property
     def model_error(self) -> ModelError | None:
         """Estimated error of the collision model; None if it freezes nothing."""
@@ -238,6 +243,16 @@ class Solved:
             "contact_replay_pct": None if self.contact_replay is None else self.contact_replay.impulse_pct,
             **({"caution": self.caution} if self.caution else {}),
         }
+
+
+def _of_version(kind: type[Solved], made_by: str) -> Solved:
+    """Solution without attributes, into which a pickle is read; InputError if another version wrote that."""
+    if made_by != __version__:
+        raise InputError(
+            f"this {kind.__name__} was pickled by impactopt {made_by}, and only that reads it; this is "
+            f"{__version__}. There, `save` it: other versions read that by load_solution"
+        )
+    return object.__new__(kind)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -436,12 +451,13 @@ class Solution(Solved):
             out["simulated"] = simulation.summary(**known)
         if replay is not None:
             out["replayed"] = replay.report(**known)
-        replayed = [run.loads for run in (replay, simulation) if run is not None]
-        slides, again = slide_caution(self.problem, self.slide), touch_caution(self.problem, plan)
+        runs = [run for run in (replay, simulation) if run is not None]
+        slides = slide_caution(self.problem, self.slide)
+        again = touch_caution(self.problem, plan, runs[-1].impulse if runs else None)
         cautions = (out.get("caution"), again, slides, self.window, overlapping(self.problem))
         if caution := " ".join(filter(None, cautions)):
             out["caution"] = caution
-        return out | gear_caution(self.problem, [self.loads, *replayed])
+        return out | gear_caution(self.problem, [self.loads, *(run.loads for run in runs)])
 
 
 def impact_summary(
@@ -492,7 +508,6 @@ def solution_of(
     statement: str,
     gains: tuple[ChosenGains, ...] = (),
     causes: tuple[Cause, ...] = (),
-    window: str = "",
     contact_error: ContactError | None = None,
 ) -> Solution:
     """The `Solution` of a refinement's outcome.
@@ -512,7 +527,7 @@ def solution_of(
         statement=statement,
         gains=gains,
         causes=causes,
-        window=window,
+        window=window_caution(t, outcome.result) if outcome.usable else "",
         contact_error=contact_error,
         plan=at.planned,
         nodes=t.nodes,

@@ -31,7 +31,6 @@ from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, wi
 from impactopt.planning.lazy_constraints import (
     LazyTerms,
     lazy_terms_of,
-    window_caution,
     with_lazy_constraints,
 )
 from impactopt.planning.models import (
@@ -200,7 +199,6 @@ def _planned(
     again = margins if gains and refined else None
     outcome = BetweenNodes(budget, again).checked(outcome)
     outcome = _with_limits_kept(outcome) if refined else outcome
-    usable = outcome.usable
     return solution_of(
         outcome,
         solver=budget.solver,
@@ -208,8 +206,7 @@ def _planned(
         statement=statement_of(t),
         gains=gains,
         causes=tuple(cause for cause in causes if cause.problem is not None),
-        window=window_caution(t, outcome.result) if usable else "",
-        contact_error=outcome.at.contact_error if usable else None,
+        contact_error=outcome.at.contact_error if outcome.usable else None,
     )
 
 

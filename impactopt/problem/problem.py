@@ -563,7 +563,7 @@ class ImpactProblem:
             "hash": self.hash,
         }
         if self.keeps_apart:
-            out["shapes"] = bodies_of(self.robot).hash
+            out["hulls"] = bodies_of(self.robot).hash
         if not self.stands:
             out["ground"] = "none" if self.ground_height is None else f"z = {self.ground_height:g} m"
         if self.collision != "full":

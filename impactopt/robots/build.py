@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.files import is_plain_file
-from impactopt.errors import InputError, check_array, check_choice, raw_array, shortened
+from impactopt.errors import InputError, check_array, check_choice, named_table, raw_array, shortened
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Striker
 from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame, reduced, tell_apart
@@ -30,6 +30,7 @@ def locked_angles(locked: Iterable[str] | Mapping[str, float]) -> dict[str, floa
         raise InputError(
             f"locked: give a list of joint names or a mapping to angles, not the text {locked!r}"
         )
+    locked = named_table(locked)
     return dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
 
 
@@ -94,7 +95,7 @@ def per_joint(
     result = np.array(default, dtype=np.float64)
     if value is None:
         return result
-    if isinstance(value, Mapping):
+    if isinstance(value := named_table(value), Mapping):
         for name, number in value.items():
             result[joint_index(joints, name, what)] = check_array(f"{what} of joint {name!r}", number, ())
         return result
@@ -185,7 +186,7 @@ def position_limit(
             for joint in moving_joints(model)
         ]
     ).reshape(-1, 2)
-    if isinstance(value, Mapping):
+    if isinstance(value := named_table(value), Mapping):
         for name, pair in value.items():
             limits[joint_index(joints, name, "position_limit")] = check_array(
                 f"position_limit of joint {name!r} (lower, upper)", pair, (2,), finite=False
@@ -349,7 +350,7 @@ def read_postures(model: pin.Model, given: Mapping[str, Mapping[str, float] | Ar
     postures = dict(found)
     for name, value in given.items():
         what = f"posture {name!r}"
-        if isinstance(value, Mapping):
+        if isinstance(value := named_table(value), Mapping):
             postures[name] = set_joints(model, found.get(name, neutral(model)), value, what)
         else:
             postures[name] = check_configuration(model, value, what)

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt.errors import InputError, Mistakes, check_choice
+from impactopt.errors import InputError, Mistakes, check_choice, named_table
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source, Striker
 from impactopt.robots.build import (
     effort_limit,
     joint_names,
     lock_joints,
+    locked_angles,
     moving_joints,
     position_limit,
     reference_configurations,
@@ -183,8 +184,8 @@ class Description:
         out = dict(given)
         for key, numbers in (("kp", self.kp), ("kd", self.kd), ("torque_limit", self.torque)):
             own = {joint: value for joint, value in numbers.items() if joint in joints}
-            if own and isinstance(given.get(key, {}), Mapping):
-                out[key] = {**own, **given.get(key, {})}
+            if own and isinstance(table := named_table(given.get(key, {})), Mapping):
+                out[key] = {**own, **table}
         springs = {
             joint: Actuator(spring_stiffness=stiffness, spring_rest=rest)
             for joint, (stiffness, rest) in with_followers(self.springs, couplings_of(model)).items()
@@ -198,7 +199,7 @@ class Description:
 
     def tendons_of(self, model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> list[Tendon]:
         """Tendons of a model with locked joints and couplings."""
-        angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
+        angles = locked_angles(locked)
         tendons = [tendon.without(angles, couplings_of(model)) for tendon in self.tendons]
         # Those with all joints locked inside their range are dropped; one outside it is kept, so that
         # `check_tendons` refuses it.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from impactopt.contact.fields import about
-from impactopt.errors import InputError, check_array, check_kind, check_number
+from impactopt.errors import InputError, check_array, check_kind, check_number, named_table
 from impactopt.robots.actuators import fitting
 from impactopt.robots.robot import Robot
 from impactopt.robots.tools import grip_limits, replaced_grips
@@ -69,7 +69,7 @@ def scaled_gains(robot: Robot, factors: Mapping[str, float]) -> Robot:
         act on.
     """
     check_kind("robot", robot, Robot)
-    check_kind("factors", factors, Mapping)
+    check_kind("factors", factors := named_table(factors), Mapping)
     each = np.ones(robot.n)
     for pattern, given in factors.items():
         factor = check_number(f"gains of {pattern!r}", given)

@@ -25,7 +25,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, named_table
 from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.robot import Robot, Striker, Tool
 
@@ -185,9 +185,9 @@ def arm_model(name: str, links: tuple[Link, ...], base: Box | None = None) -> An
 def with_overrides(options: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """A preset's options with a user's; a table by joint or posture adds to that of the preset."""
     tables = {
-        name: {**options[name], **given}
+        name: {**options[name], **table}
         for name, given in overrides.items()
-        if isinstance(given, Mapping) and isinstance(options.get(name), Mapping)
+        if isinstance(table := named_table(given), Mapping) and isinstance(options.get(name), Mapping)
     }
     return {**options, **overrides, **tables}
 

@@ -129,6 +129,7 @@ def _sampled(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:
 
 ALLOWED = 1e-2  # error of the impulse by the steps, relative
 HALVINGS = 3  # of the step, at most
+REGULAR = (1.5, 4.5)  # growth of an impulse's change from one doubling of a short step to the next
 ALLOWED_RANGE = 1e-3  # [rad] out of range that is not reported
 COMPARED_AFTER = 0.02  # [s] after the impact up to which two simulations are compared
 STEP_RANGE = (1e-6, 1e-2)  # [s]: below, a replay takes hours; above, it steps over most contacts
@@ -188,10 +189,12 @@ def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any)
     """Simulation by an engine, with an estimate of its impulse's error by the steps.
 
     The step is at most that of `longest_stable_step`, and divides a controller's own period, as it is else
-    sampled at another rate; so do the steps of comparison. The impulse up to the end of the impact is
-    compared with that of a simulation with about twice the step, or, if the given step is longer than the
-    engine's default, with the default. If the error is above 1 %, or the simulation diverges, the step is
-    halved, at most three times; a given step longer than the default is kept.
+    sampled at another rate; so do the steps of comparison. Impulses up to the end of the impact are compared
+    with those of about two and four times the step. The error is the change for twice the step if the changes
+    grow as they do where steps are short; else it is the spread of all three. Of a step that is longer than
+    the engine's default, or nearly unstable, the difference from a shorter one is added to the error of that.
+    If the error is above 1 %, or the simulation diverges, the step is halved, at most three times; a given
+    step longer than the default is kept.
     """
     # the default of the engine's signature
     own = float((run.__kwdefaults__ or {})["step"])
@@ -232,7 +235,7 @@ def _step_error(
     stable: float,
     period: float,
 ) -> float:
-    """Difference of two simulations' impulses, relative to the larger; nan if both missed the target.
+    """Estimated error of a simulation's impulse, relative to the largest that is compared; nan if all missed.
 
     own, stable, period [s] : default step of the engine; `longest_stable_step`; a controller's own, else 0.
     """
@@ -240,21 +243,39 @@ def _step_error(
     until = np.inf if np.isnan(end) else end + COMPARED_AFTER
     if simulation.missed or (until == np.inf and step <= own):
         return np.nan
-    coarse = period / max(round(period / step) // 2, 1) if period else 2 * step
-    others = own if step > own else coarse, step / 2
-    for other in others if step < stable else others[1:]:
-        # an engine rounds the time at which it ends to steps; up to `last` there are both simulations
-        longest = max(step, other)
-        last = min(until, options.get("until", np.inf) - longest)
+    shortest = min(step, own)
+    while 4 * shortest >= 2 * stable:  # longer ones are unstable
+        shortest /= 2
+    steps = [shortest, 2 * shortest, 4 * shortest]
+    if period:
+        count = math.ceil((1 - 1e-9) * period / shortest)
+        steps = [period / max(count // k, 1) for k in (1, 2, 4)]
+    # an engine rounds the time at which it ends to steps; up to `last` there are all simulations
+    longest = max(step, steps[-1])
+    last = min(until, options.get("until", np.inf) - longest)
+    found = simulation.impulse_until(last)
+
+    def impulse(other: float) -> float:
+        if math.isclose(other, step):
+            return found
         try:
             compared = run(*given, **{**options, "step": other, "until": last + longest})
         except InputError:
-            continue  # twice the step may be too long for the servo
-        impulses = [s.impulse_until(last) for s in (simulation, compared)]
-        largest = max(impulses)
-        return abs(impulses[0] - impulses[1]) / largest if largest > 0 else np.nan
-    # all steps tried diverge
-    return np.inf
+            return np.nan  # too long for the servo
+        return compared.impulse_until(last)
+
+    compared = np.array([impulse(other) for other in steps])
+    known = compared[np.isfinite(compared)]
+    if np.isnan(compared[0]) or len(known) < 2:
+        return np.inf
+    double, fourfold = np.diff(compared)
+    # of an engine of first order the change doubles with the step, of second order it grows fourfold
+    growth = fourfold / double if double else np.nan
+    left = np.ptp(known)
+    if REGULAR[0] <= growth <= REGULAR[1]:
+        left = abs(double) / min(growth - 1, 1.0)
+    largest = max(found, *known)
+    return float((abs(found - compared[0]) + left) / largest) if largest > 0 else np.nan
 
 
 def check_steps(simulation: Simulation, step: float | None) -> None:

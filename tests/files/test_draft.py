@@ -648,6 +648,8 @@ def test_a_telescope_that_reaches_to_a_side_strikes_there(tmp_path: Path) -> Non
 def test_of_two_arms_the_other_one_waits_where_its_motors_hold_it(tmp_path: Path) -> None:
     draft = _drafted(tmp_path, _two_arms(), planned=True)
     said = next(line for line in draft.said if "that have a whole motion" in line)
+    said, _, more = said.partition("; ")
+    assert more == "`solve --starts 8` may find a harder motion"
     (tmp_path / "robot.toml").write_text(draft.text)
     problem = load_problem(tmp_path / "robot.toml")
     robot, q = problem.robot, problem.start_posture

@@ -180,26 +180,42 @@ def test_a_problem_that_has_changed_since_its_plan_is_told(saved: Path, tmp_path
         assert not load_planned(heavier).of_other_problem
 
 
+def hulls_of_arm(folder: Path, old: str, new: str) -> str:
+    """Hash of the shapes of an arm's links, with a change in its URDF."""
+    assert old in urdfs.arm()
+    (folder / "robot.urdf").write_text(urdfs.arm().replace(old, new, 1), "utf-8")
+    text = bolted_arm(
+        frame="wrist_link",
+        tip=[0.0, 0.0, 0.1],
+        point=[0.6, 0.0, 0.5],
+        normal=[1.0, 0.0, 0.0],
+        start="raised",
+        postures={"raised": {"shoulder": 0.5, "elbow": 1.0}},
+    )
+    (folder / "arm.toml").write_text(text, "utf-8")
+    return str(load_problem(folder / "arm.toml").describe()["hulls"])
+
+
 def test_a_link_that_has_grown_since_the_plan_is_told(saved: Path, tmp_path: Path) -> None:
     """The plan keeps clear of the old shape."""
-    file, shapes = tmp_path / "arm.toml", []
-    for size in ("0.08 0.08 0.3", "0.5 0.08 0.3"):
-        (tmp_path / "robot.urdf").write_text(urdfs.arm().replace("0.08 0.08 0.3", size, 1), "utf-8")
-        text = bolted_arm(
-            frame="wrist_link",
-            tip=[0.0, 0.0, 0.1],
-            point=[0.6, 0.0, 0.5],
-            normal=[1.0, 0.0, 0.0],
-            start="raised",
-            postures={"raised": {"shoulder": 0.5, "elbow": 1.0}},
-        )
-        file.write_text(text, "utf-8")
-        shapes.append(load_problem(file).describe()["shapes"])
-    assert shapes[0] != shapes[1]
+    before, after = (
+        hulls_of_arm(tmp_path, "0.08 0.08 0.3", size) for size in ("0.08 0.08 0.3", "0.5 0.08 0.3")
+    )
+    assert before != after
     summary = load_record(saved).summary
-    known = {**summary, "problem": {**summary["problem"], "shapes": shapes[0]}}
+    known = {**summary, "problem": {**summary["problem"], "hulls": before}}
     with pytest.warns(UserWarning, match="grown is another one today"):
         load_planned(resaved(saved, tmp_path / "grown", summary=known))
+
+
+def test_a_shape_that_differs_by_rounding_alone_is_the_same(tmp_path: Path) -> None:
+    """A plate of an eighth of an inch, 1587.5 um from its middle to each face, also turned over."""
+    shape = '<origin xyz="0.0 0.0 0.15"{}/><geometry><box size="0.08 {} 0.3"/>'
+    found = [
+        hulls_of_arm(tmp_path, shape.format("", 0.08), shape.format(f' rpy="0 0 {angle}"', 0.003175))
+        for angle in (0.0, np.pi)
+    ]
+    assert found[0] == found[1]
 
 
 def test_a_result_without_a_motion_has_nothing_to_replay(tmp_path: Path) -> None:

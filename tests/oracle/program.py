@@ -111,7 +111,6 @@ class Program:
         self.problem, self.robot = problem, robots[problem.blow]
         self.limits = Limits(problem, self.robot)
         self._names = {name for name, _, _ in claims.groups}
-        self._stages = sum(count for name, count, _ in claims.groups if name == IN_CONTACT)
         self.missing = unknown(problem)
         self.rows: list[Piece] = []
         self.worth: list[Piece] = []
@@ -133,6 +132,7 @@ class Program:
             "feed-forward at contact": (np.array([-fraction]), np.array([fraction]))
         }
         self.blows: list[Blow] = []
+        self._stages = 0  # with positions in contact
         self._coasting: Callable[[Variables], Any] | None = None
         if problem.lasts and problem.frozen is None:
             self._blows(claims)
@@ -142,8 +142,6 @@ class Program:
             self.rows += [*change_pieces(each, self.node), *height_pieces(problem, each)]
         self._touch()
         self._clearance()
-        self._slide()
-        self._reference_range()
         self._first_touch()
         self._ground_force()
         found, strange = apart_pieces(
@@ -154,6 +152,8 @@ class Program:
         self.rows += orientation_pieces(problem, self.robot, self.at_contact)
         self.rows += gaze_pieces(problem, self.ways[0])
         if self.blows:
+            self._slide()
+            self._reference_range()
             self._links()
             self._balance()
             drives = Drives(self, self._names, self._coasting)
@@ -176,6 +176,7 @@ class Program:
             self.scales |= blow.scales()
             self.bounds |= blow.bounds(claims.guarded)
             self.rows += blow.pieces()
+        self._stages = sum(count for name, count, _ in claims.groups if name == IN_CONTACT)
 
     def at_contact(self, v: Variables) -> Array:
         """Coordinates at contact."""

@@ -301,9 +301,11 @@ def _bodies(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
     """Exact distances between all bodies that are not to touch, at all instants that a record has."""
     phase, q = np.asarray(arrays["reference_phase"]), np.asarray(arrays["reference_q"])
     time = np.asarray(arrays["reference_time"])
-    parts = [(time[k], q[k], np.full(int(k.sum()), n), n) for n in (0, 2) if (k := phase == n).any()]
+    # without a known contact, nothing is known of the target's motion after it
+    known = (0, 2) if p.blows else (0,)
+    parts = [(time[k], q[k], np.full(int(k.sum()), n), n) for n in known if (k := phase == n).any()]
     bodies = p.problem.bodies
-    gone, across, drift = 0.0, np.zeros(3), np.zeros(3)
+    gone, speed, across, drift = 0.0, 0.0, np.zeros(3), np.zeros(3)
     if p.blows:
         blow, y0 = p.blows[0], p.at_contact(v)
         stages = [blow.moved(v, i, y0) for i in range(len(blow.stages))]
@@ -324,8 +326,6 @@ def _bodies(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
         speed = float(p.problem.target.velocity(state, blow.target))
         if p.problem.target.stays:
             speed = 0.0
-    else:
-        speed = 0.0
     if "missed_q" in arrays:
         after = np.asarray(arrays["missed_phase"]) == 2
         postures = np.asarray(arrays["missed_q"])[after]

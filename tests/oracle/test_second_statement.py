@@ -37,8 +37,10 @@ from impactopt import (
     TargetSpeed,
     Trajectory,
     load_problem,
+    solve,
     space_arm,
 )
+from impactopt.files.output import record_of
 from impactopt.planning.clearance_constraints import Margins, Watch
 from impactopt.robots.couplings import Tendon
 from impactopt.transcription.contact_refinement import contact_error
@@ -49,7 +51,7 @@ from oracle.kkt import lagrangian_gradient
 from oracle.program import Program, unknown
 from oracle.recorded import off_in_record
 from oracle.variables import Variables
-from oracle.verdict import claims_of
+from oracle.verdict import claims_of, verify_record
 
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
 ALLOWED = {"bodies", "contact", "errors", "kinematics", "problem", "robots"}
@@ -124,8 +126,12 @@ def test_of_bodies_that_are_kept_apart_in_contact(build: Callable[[], Any], mode
     t = transcribed(problem, MoreNodes(contact=True))
     rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).constraints(0.5)
     assert any("compression" in row.place for row in rows)
-    if model == "full":  # the oracle does not know frozen models
+    if model == "full":
         check_rows(t.with_clearance(rows))
+    else:  # the oracle does not know frozen models, and says so
+        program, _ = second(t.with_clearance(rows), first_iterate(t))
+        assert "the model 'sdc' of the collision" in program.missing
+        assert any("compression" in what for what in program.missing)
     x = first_iterate(t)
     off = [k for k, o in enumerate(t.constraints.origins) if o.term == "position in contact"]
     assert np.abs(t.program.constraints(x)[off]).max() < 1e-12
@@ -198,6 +204,20 @@ def test_of_a_board_whose_events_have_an_order(
 def test_of_a_slide_that_is_bounded() -> None:
     p = arm_problem()
     check_rows(transcribed(dataclasses.replace(p, terms=(*p.terms, Slide(most=0.02)))))
+
+
+@pytest.mark.parametrize("model", ["rigid", "sdc"])
+def test_of_a_collision_model_that_is_not_known(model: str) -> None:
+    """The verdict says so, and finds nothing wrong in what it knows."""
+    p = arm_problem()
+    terms = (*p.terms, Slide(most=0.02), ReferenceRange(margin=0.1))
+    solution = solve(dataclasses.replace(p, collision=model, terms=terms))
+    record = record_of(solution, problem="")
+    verdict = verify_record(solution.problem, record.arrays, record.summary)
+    assert not verdict.ok and verdict.max_violation < 1e-6
+    reasons = verdict.reason.split("; ")
+    assert f"not known to verify: the model {model!r} of the collision" in reasons
+    assert all(reason.startswith("not known to verify: ") for reason in reasons)
 
 
 @pytest.mark.parametrize("make", [arm_problem, biped_problem])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import signal
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -27,6 +28,7 @@ from impactopt import (
     Status,
     TorqueLimit,
     load_problem,
+    load_solution,
     solve,
 )
 from impactopt.planning.bounds import bounds_of
@@ -134,7 +136,7 @@ def test_the_robots_own_weight(arm: ImpactProblem) -> None:
 
 
 @pytest.mark.slow
-def test_a_window_that_takes_nearly_all_is_told(arm: ImpactProblem) -> None:
+def test_a_window_that_takes_nearly_all_is_told(arm: ImpactProblem, tmp_path: Path) -> None:
     """Half a period of 1 kg on 1e3 N/m takes 99 ms: in 15 ms a phase there is no blow worth its name."""
     law = dataclasses.replace(arm.law, stiffness=1e3, damping=0.0)
     problem = dataclasses.replace(arm, target=FreeMass(mass=1.0), law=law, objectives=(Impulse(),))
@@ -142,6 +144,9 @@ def test_a_window_that_takes_nearly_all_is_told(arm: ImpactProblem) -> None:
     assert narrow.status.usable
     assert "[collision] duration_s allows, 15 ms" in narrow.window
     assert narrow.window in narrow.summary()["caution"]
+    # also of the solution that is saved, and of one that is moved
+    assert load_solution(narrow.save(tmp_path)).window == narrow.window
+    assert "of the objective" in narrow.moved(mass=1.05).window
     # effort is a cost: the same impulse leaves less, of which the same gain is a larger part
     costly = solve(dataclasses.replace(narrow.problem, objectives=(Impulse(), Effort(weight=0.03))))
     told, of_less = (float(s.window.split("gains ")[1].split(" %")[0]) for s in (narrow, costly))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -11,8 +12,9 @@ import numpy as np
 import pytest
 
 from impactopt import ImpactProblem, InputError, Status, StrikeSolution, load_problem, optimize_strike, solve
-from impactopt.planning import multistart
+from impactopt.planning import multistart, solution
 from impactopt.simulation.workers import Died
+from impactopt.transcription import plan as planned
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +44,20 @@ def test_a_problem_and_its_solution_are_pickled(arm: ImpactProblem, strike: Stri
     assert again.impulse == strike.impulse
     assert np.array_equal(again.problem.coordinates.start, arm.coordinates.start)
     assert again.problem.hash == arm.hash
+
+
+def test_a_pickle_of_another_version_is_refused_with_both_versions(
+    strike: StrikeSolution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before a class is looked for that this version may not have."""
+    pickled = pickle.dumps(strike)
+    made_by = solution.__version__
+    monkeypatch.setattr(solution, "__version__", "99.0")
+    monkeypatch.delattr(planned, "PlannedStrike")
+    with pytest.raises(
+        InputError, match=f"StrikeSolution was pickled by impactopt {re.escape(made_by)}, .* this is 99.0"
+    ):
+        pickle.loads(pickled)
 
 
 def given(monkeypatch: pytest.MonkeyPatch, *found: Any) -> None:

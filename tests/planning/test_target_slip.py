@@ -139,9 +139,14 @@ def test_a_target_that_is_met_again_is_told(kept_off: bool) -> None:
         terms=(apart,) if kept_off else (),
     )
     solution = solve(problem)
-    caution, replay = solution.summary().get("caution", ""), solution.validate()
+    replay = solution.validate()
+    caution = solution.summary(replay).get("caution", "")
     assert solution.status is Status.SOLVED
     assert ("meets the target again" in caution) is (len(replay.touches) > 1) is not kept_off
+    if not kept_off:
+        share = f": {replay.impulse:.3g} N s in a replay, {solution.impulse:.3g} N s as planned; "
+        assert share in caution and replay.impulse > 10 * solution.impulse
+        assert share not in solution.summary()["caution"]
 
 
 @dataclass(frozen=True, kw_only=True)

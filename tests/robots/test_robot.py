@@ -17,7 +17,18 @@ import pytest
 from scipy.spatial import ConvexHull
 
 import impactopt
-from impactopt import InputError, Robot, Sole, Striker, g1, load_robot, talos
+from impactopt import (
+    GearLoad,
+    InputError,
+    Robot,
+    Sole,
+    Striker,
+    g1,
+    load_robot,
+    planar_arm,
+    scaled_gains,
+    talos,
+)
 from impactopt.codegen.cache import model_hash
 from impactopt.errors import check_array, did_you_mean
 from impactopt.robots import presets
@@ -615,3 +626,23 @@ def test_public_names_are_there_and_cost_nothing_until_used() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True
     )
     assert printed.stdout.strip() == "[]"
+
+
+def test_a_table_by_joint_may_be_a_pandas_series() -> None:
+    """By its names: as an array it would count in its own order."""
+    pandas = pytest.importorskip("pandas")
+    table = {"wrist": 0.5, "shoulder": 0.9}
+
+    def made(given: Any) -> Robot:
+        robot = planar_arm(kp=given, armature=given, postures={"raised": given})
+        return scaled_gains(robot, given)
+
+    one, other = made(table), made(pandas.Series(table))
+    for name in ("kp", "kd", "armature"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(one.posture("raised"), other.posture("raised"))
+    assert planar_arm(locked=pandas.Series({"wrist": 0.5})).joint_names == ("shoulder", "elbow")
+    assert GearLoad(limit=pandas.Series(table)) == GearLoad(limit=table)
+    # without names it is an array
+    kp = pandas.Series([1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(planar_arm(kp=kp).kp, kp)

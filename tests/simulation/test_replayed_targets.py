@@ -335,6 +335,33 @@ def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[
         assert ("the board breaks" in labels) == isinstance(target, Board)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mass", "rate", "step"), [(0.05, 300.0, None), (0.2, 1400.0, None), (0.05, 300.0, 4e-4)]
+)
+def test_the_error_by_the_steps_covers_that_of_a_light_hand_on_a_stiff_servo(
+    mass: float, rate: float, step: float | None
+) -> None:
+    """It drives a nail by less than half a millimetre: steps are too long for the error to follow an order.
+
+    Impulses of one step and of twice it agree by chance.
+    """
+    speed, begun = 0.5, 0.01
+    held = slider(mass, kd=mass * rate, kp=30 * mass * rate, torque_limit=1e4)
+    before, after = np.linspace(0.0, begun, 41), np.linspace(begun, 0.04, 41)
+    time, far = np.append(before, after), speed * begun / 2
+    q = np.append(speed * before**2 / (2 * begun), far + speed * (after - begun))
+    v = np.append(speed * before / begun, np.full(41, speed))
+    push = np.repeat([mass * speed / begun, 0.0], 41)[:, None]
+    ref = reference(time, q[:, None], v[:, None], push, nv=1, n=1)
+    law, nail = KelvinVoigt(stiffness=5e5, damping=100.0), Nail(mass=0.05, resistance=12.0, hardening=1e4)
+    there = scene(point=np.array([far + 0.002 * speed, 0.0, 0.0]), law=law, target=nail)
+    given = {} if step is None else {"step": step}
+    done = with_step_error(simulate_mujoco, held, ref, there, settle=0.0, **given)
+    exact = simulate_pinocchio(held, ref, there, settle=0.0, step=2e-5).impulse
+    assert 1e-4 < abs(done.impulse / exact - 1) <= done.step_error < 1e-2
+
+
 def test_a_touch_that_lasts_longer_than_what_is_compared_is_no_error_of_the_steps() -> None:
     """A point mass that is pushed back to a wall 11 ms after the blow, and stays there."""
     robot, back = slider(1.0), 50.0

@@ -459,10 +459,13 @@ def _strike_message(strong: list[Strong], best: tuple[int, float] | None, *, tri
     k, objective = best or (0, strong[0].objective)
     normal = ", ".join(f"{x:.3g}" for x in strong[k].normal)
     with_motion = " that have a whole motion" if best else ""
-    none = "; no whole motion to it, or to another one, was found" if tried and not best else ""
+    # a motion is planned from one initial guess, and its strike does not show what others would find
+    after = "; `solve --starts 8` may find a harder motion" if best else ""
+    if tried and not best:
+        after = "; no whole motion to it, or to another one, was found"
     return (
         f"the drafted strike, along [{normal}] ({_in_words(strong[k].normal)}), is the hardest of those "
-        f"tried{with_motion}: {objective:.3g} {strong[k].unit}{none}"
+        f"tried{with_motion}: {objective:.3g} {strong[k].unit}{after}"
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from impactopt.bodies.world import TargetBody
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.errors import InputError, check_kind
+from impactopt.errors import InputError, check_kind, named_table
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import ELEMENTS, File, SolverSettings, comment_at, defaults_of
 from impactopt.files.sections.collision import LAWS, TARGETS, Body, ProblemSection
@@ -84,13 +84,13 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
         data["floating"] = options["floating"]
     if "gravity" in options:
         data["gravity_m_s2"] = plain_value(options["gravity"])
-    locked = options.get("locked", ())
+    locked = named_table(options.get("locked", ()))
     angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
     if angles or (locked != () and source.preset is not None):
         data["locked_rad"] = plain_value(angles)
     for name in BY_JOINT:
-        if isinstance(options.get(name), (int, float, Mapping)):
-            data[ROBOT_KEYS[name]] = plain_value(options[name])
+        if isinstance(numbers := named_table(options.get(name)), (int, float, Mapping)):
+            data[ROBOT_KEYS[name]] = plain_value(numbers)
     if "soles" in options:
         data["soles"] = [sole_data(sole) for sole in options["soles"]]
     if options.get("strikers") and source.preset is None:
@@ -101,7 +101,11 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
     if grips:
         data["grips"] = {name: section_data(GripSection, grip) for name, grip in grips.items()}
     postures = options.get("postures", {})
-    named = {name: plain_value(angles) for name, angles in postures.items() if isinstance(angles, Mapping)}
+    named = {
+        name: plain_value(table)
+        for name, angles in postures.items()
+        if isinstance(table := named_table(angles), Mapping)
+    }
     return data | ({"postures_rad": named} if named else {})
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from impactopt.bodies.world import vector
 from impactopt.contact.fields import About, Described, abouts, snake_case
-from impactopt.errors import MOST, InputError, check_number, shortened
+from impactopt.errors import MOST, InputError, check_number, named_table, shortened
 
 _NO_METADATA = About(what="", least=0)  # of fields without metadata
 
@@ -59,7 +59,7 @@ class Term(Described):
 
     def _check(self, field: Field[Any], about: About) -> None:
         """Check a field's value, and replace numbers by floats; fields of other types are not checked."""
-        value = getattr(self, field.name)
+        value = named_table(getattr(self, field.name)) if about.by_joint else getattr(self, field.name)
         # a class, unless annotations are text, as with `from __future__ import annotations`
         kind = field.type.__name__ if isinstance(field.type, type) else str(field.type)
         if kind == "bool":

@@ -36,7 +36,7 @@ from impactopt.problem.terms import (
     TargetSpeed,
 )
 from oracle.apart import apart_pieces
-from oracle.blow import Blow
+from oracle.blow import Blow, spells_of
 from oracle.drives import COASTED, Drives, node_torque
 from oracle.motions import NONE, Limits, Way, momentum_pieces, node_piece, rate_pieces
 from oracle.robot_motion import RobotMotion
@@ -291,8 +291,16 @@ class Program:
         }
         others = [*self._since(1), *(self._since(2) if len(self.courses) > 2 else ())]
         out |= {place: lambda v: np.zeros(3) for place, _ in others}
-        if not (self.blows and moves):
+        if not moves:
             return out | {self.blows[0].place(i): out[others[0][0]] for i in range(self._stages)}
+        if not self.blows:  # what its displacements are, is not known: they are taken for right
+            first = f"{term}, end of {spells_of(p)[-1].name}"
+            names = {place: f"{term}, {place}" for place, _ in self._since(1)}
+            names |= dict.fromkeys([self.ways[1].place(0.0), *(names if p.target.stays else ())], first)
+            known_there = {place: name for place, name in names.items() if name in self._names}
+            return out | {
+                place: lambda v, name=name: axes @ v.get(name) for place, name in known_there.items()
+            }
         blow = self.blows[0]
 
         def across(v: Variables, i: int) -> Array:

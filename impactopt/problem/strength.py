@@ -366,7 +366,7 @@ def touches(problem: ImpactProblem, *postures: Array) -> bool:
     """True if bodies touch in one of these configurations (nq,), with the target as before contact."""
     none: Array = np.zeros(len(postures))
     at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))
-    return bool(problem.bodies.survey(none + np.arange(len(postures)), at).touches)
+    return bool(problem.bodies.touches(none + np.arange(len(postures)), at))
 
 
 def best_share(problem: ImpactProblem) -> tuple[float, EstimatedImpact] | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -124,6 +124,10 @@ class ContactLaw(Described, ABC):
 
     def formula(self) -> tuple[str, str, str]:
         """Both branches and `separation` as text in generic symbols, from which cache keys are made."""
+        return self._formula
+
+    @cached_property
+    def _formula(self) -> tuple[str, str, str]:
         names = {name: ca.SX.sym(name) for name in self.parameters}
         x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
         compression, restitution = (text_of([self.branch(x, rate, c, names)]) for c in (True, False))

@@ -97,7 +97,7 @@ class ContactLaw(Described, ABC):
         """
         return numbers_of(self)
 
-    @property
+    @cached_property  # a program of one touch asks a dozen times
     def switches(self) -> bool:
         """True if compression and restitution are different branches."""
         compression, restitution, _ = self.formula()
@@ -124,10 +124,6 @@ class ContactLaw(Described, ABC):
 
     def formula(self) -> tuple[str, str, str]:
         """Both branches and `separation` as text in generic symbols, from which cache keys are made."""
-        return self._formula
-
-    @cached_property
-    def _formula(self) -> tuple[str, str, str]:
         names = {name: ca.SX.sym(name) for name in self.parameters}
         x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
         compression, restitution = (text_of([self.branch(x, rate, c, names)]) for c in (True, False))

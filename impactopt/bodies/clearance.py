@@ -293,6 +293,10 @@ class Bodies:
                 return found
         return self._survey(time, at, within)
 
+    def touches(self, time: Array, at: Places) -> tuple[Touch, ...]:
+        """Penetrations of a survey alone: pairs whose smooth distance is larger than `SLACK` have none."""
+        return self._survey(time, at, SLACK).touches
+
     def _survey(self, time: Array, at: Places, within: float) -> Survey:
         least, when, which = FAR, 0, None
         found: dict[Pair, list[tuple[int, float]]] = {}

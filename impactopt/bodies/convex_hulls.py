@@ -225,11 +225,20 @@ def _rod(start: Array, end: Array, radius: float) -> Solid:
     return cylinder(radius, length).moved(np.eye(3), np.array([0.0, 0.0, length / 2])).moved(turn, start)
 
 
-def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
-    """Hull of a solid, cached on disk; None if it has no volume."""
-    digest = hashlib.sha256(np.round(solid.vertices, 9).tobytes() + b"thinned").hexdigest()
+_HULLS: dict[str, dict[str, Any]] = {}
+_MOST_HULLS = 1000  # of some 10 kB
 
-    hull = cached_arrays("hull", digest, lambda: _hull_of(solid.vertices))
+
+def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
+    """Hull of a solid, cached here and on disk; None if it has no volume."""
+    digest = hashlib.sha256(np.round(solid.vertices, 9).tobytes() + b"thinned").hexdigest()
+    # A draft reads its robot's shapes ten times.
+    hull = _HULLS.get(digest)
+    if hull is None:
+        hull = cached_arrays("hull", digest, lambda: _hull_of(solid.vertices))
+        if len(_HULLS) >= _MOST_HULLS:
+            _HULLS.clear()
+        _HULLS[digest] = hull
     return Piece(link=link, joint=joint, **hull) if len(hull["triangles"]) else None
 
 

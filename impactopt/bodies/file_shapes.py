@@ -6,6 +6,7 @@ import contextlib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +38,14 @@ class LinkShape:
 def urdf_elements(urdf: str | None, tag: str) -> list[ElementTree.Element]:
     """Elements of a URDF with this tag; none without a URDF, or if it cannot be read."""
     try:
-        return [] if urdf is None else parse_urdf(urdf).findall(tag)
+        return [] if urdf is None else _parsed(urdf, Path(urdf).stat().st_mtime_ns).findall(tag)
     except (OSError, InputError):
         return []
+
+
+@lru_cache(maxsize=1)
+def _parsed(urdf: str, _changed: int) -> ElementTree.Element:
+    return parse_urdf(urdf)
 
 
 def shapes_of(

@@ -73,6 +73,11 @@ class RobotBodies:
         return tuple((j, parent) for j, parent in parents if parent in self.joints)
 
     @cached_property
+    def faces(self) -> dict[Any, StrikerFace | None]:
+        """Cache of `striker_face`, which terms ask for with every program that is built."""
+        return {}
+
+    @cached_property
     def balls(self) -> dict[int, tuple[Array, float]]:
         """Bounding ball of each joint's pieces: centre (3,) and radius [m]."""
         return {
@@ -109,11 +114,28 @@ class RobotBodies:
         whose hulls touch in the start posture ``q`` (nq,), or nearly (`FITTED`) if few joints are between
         them, as neighbours beyond a short link always do.
         """
+        # Copies of a problem, such as one with other prices, have the same start posture.
+        key, known = (q.tobytes(), frozenset(disabled)), self._known_pairs
+        found = known.get(key)
+        if found is None:
+            found = self._piece_pairs(q, key[1])
+            known.clear()
+            known[key] = found
+        return found
+
+    @cached_property
+    def _known_pairs(self) -> dict[Any, Any]:
+        """The last result of `piece_pairs`, by its arguments."""
+        return {}
+
+    def _piece_pairs(
+        self, q: Array, excluded: frozenset[frozenset[str]]
+    ) -> tuple[dict[Pair, tuple[tuple[Piece, Piece], ...]], list[tuple[str, str]]]:
         model, data = self.robot.model, self.robot.model.createData()
         pin.forwardKinematics(model, data, q)
         places = {j: transform(data.oMi[j].rotation, data.oMi[j].translation) for j in self.joints}
         out: dict[Pair, tuple[tuple[Piece, Piece], ...]] = {}
-        touching, excluded = [], set(disabled)
+        touching = []
         for n, a in enumerate(self.joints):
             for b in self.joints[:n]:
                 if (a, b) in self.connected:
@@ -224,6 +246,13 @@ def striker_face(
     axis (3,) : its outward unit vector in the striker's frame, if known. Else it is the mean normal, weighted
         by area, of the hull's facets next to the striking point.  assumed : also use boxes of links' inertia.
     """
+    known, key = bodies_of(robot).faces, (striker, None if axis is None else tuple(axis), assumed)
+    if key not in known:
+        known[key] = _striker_face(robot, striker, axis, assumed)
+    return known[key]
+
+
+def _striker_face(robot: Robot, striker: str, axis: Array | None, assumed: bool) -> StrikerFace | None:
     hit = robot.striker(striker)
     model, bodies = robot.model, bodies_of(robot)
     frame = model.frames[model.getFrameId(hit.frame)]

@@ -213,6 +213,10 @@ class Separations:
         self._turn = np.zeros((self.count, 4 * (self.joints + 3)))
         # nan equals no z, so everything is computed anew.
         self._seen = np.full((self.count, self.joints + 3), np.nan)
+        # once, as a solve calls `write` ten thousand times
+        self._chains = [*map(address, (self.numbers, self._hulls, self._shapes.blocks))]
+        kept = (self.directions, self._known, self._seen, self._turn, self._room)
+        self._kept = [*map(address, kept)]
 
     def write(self, what: int, z: Array, out: Array, factors: Array | None = None) -> None:
         """Writes to ``out`` values (what = 0), gradients (1), or Hessians times ``factors`` (2).
@@ -228,9 +232,10 @@ class Separations:
         library.separation(
             ctypes.c_int64(self.count),
             ctypes.c_int64(self.joints),
-            *map(address, (z, self.numbers, self._hulls, self._shapes.blocks)),
+            address(z),
+            *self._chains,
             ctypes.c_double(1 / ROUNDING),
-            *map(address, (self.directions, self._known, self._seen, self._turn, self._room)),
+            *self._kept,
             ctypes.c_int64(what),
             *map(address, (by, out)),
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import weakref
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -90,6 +92,9 @@ FACING_DAMPING = 0.1  # of orientation; position and soles have 1e-8, so that th
 # [rad] standard deviation of random joint offsets from the guess: in the first attempt, if it has an
 # orientation to reach, and in later attempts
 FIRST_SPREAD, SPREAD = 0.1, 0.3
+# Postures of a robot, or why there is none: copies of a problem with another law or price ask for the same.
+_KNOWN: weakref.WeakKeyDictionary[Robot, dict[bytes, Array | str]] = weakref.WeakKeyDictionary()
+_MOST_KNOWN = 1000
 
 
 def inverse_kinematics(
@@ -120,6 +125,36 @@ def inverse_kinematics(
     InputError : no posture found; the message has the smallest error, and the striking points of that posture
         and of the guess.
     """
+    given = (striker, also, point, guess, facing, margin, starts, tolerance)
+    legs = [(leg.frame, leg.placement.homogeneous.tobytes()) for leg in coordinates.legs]
+    key = pickle.dumps((legs, given))
+    known = _KNOWN.setdefault(coordinates.robot, {})
+    found = known.get(key)
+    if found is None:
+        try:
+            found = _searched(coordinates, *given)
+        except InputError as error:
+            found = str(error)
+        if len(known) >= _MOST_KNOWN:
+            known.clear()
+        known[key] = found
+    if isinstance(found, str):
+        raise InputError(found)
+    return found.copy()
+
+
+def _searched(
+    coordinates: StanceCoordinates,
+    striker: str,
+    also: Sequence[tuple[str, Array]],
+    point: Array,
+    guess: Array,
+    facing: tuple[Array, Array] | None,
+    margin: float,
+    starts: int,
+    tolerance: float,
+) -> Array:
+    """Posture of `inverse_kinematics`."""
     robot, model = coordinates.robot, coordinates.model
     data = model.createData()
     aims = [(striker, point), *also]

@@ -234,7 +234,7 @@ def blocked(problem: ImpactProblem) -> list[str]:
     found = list[Touch]()
     for q in _postures_at_hit(problem):
         at = Places.of(problem.robot, q[None], np.zeros(1, dtype=np.intp))
-        touches = bodies.survey(np.zeros(1), at).touches
+        touches = bodies.touches(np.zeros(1), at)
         if not touches or touches[0].depth < BLOCKED_DEPTH:
             return []
         found.append(touches[0])

@@ -365,7 +365,7 @@ def random_postures(robot: Robot, striker: str, q: Array, count: int, seed: int 
 def touches(problem: ImpactProblem, *postures: Array) -> bool:
     """True if bodies touch in one of these configurations (nq,), with the target as before contact."""
     at = Places.of(problem.robot, np.array(postures), np.zeros(len(postures), dtype=np.intp))
-    return bool(problem.bodies.survey(np.arange(float(len(postures))), at).touches)
+    return bool(problem.bodies.touches(np.arange(float(len(postures))), at))
 
 
 def best_share(problem: ImpactProblem) -> tuple[float, EstimatedImpact] | None:

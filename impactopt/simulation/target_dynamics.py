@@ -163,9 +163,14 @@ class TargetContact:
             )
         end, impulses = found.y[:, -1], found.y[h : 2 * h]
 
+        # The interpolant is for instants between the integration's own.
+        known = dict(zip(found.t.tolist(), found.y.T, strict=True))
+
         @cache
         def found_forces(t: float) -> Array:
-            return forces(t, found.sol(t))[0]
+            if t not in known:
+                known[t] = found.sol(t)
+            return forces(t, known[t])[0]
 
         times = _with_both_sides(found.t, lambda t: bool(found_forces(t).any()))
         values = np.array([found_forces(t) for t in times])
@@ -179,7 +184,7 @@ class TargetContact:
             depths=np.where(np.isfinite(depths), end[:h], -np.inf),
             times=times,
             total=total,
-            given=found.sol(times)[h : 2 * h].sum(axis=0),
+            given=np.array([known[t][h : 2 * h].sum() for t in times]),
         )
 
     def untouched_step(self, state: Array, travel: float, step: float) -> tuple[Array, float]:

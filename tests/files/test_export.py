@@ -246,7 +246,7 @@ def test_rates_are_those_of_the_curve(arm: Solution, tmp_path: Path, which: str)
 
 def test_ros2_is_a_goal_that_replays_as_the_plan_does(arm: Solution, tmp_path: Path) -> None:
     _, path = arm.export("ros2", tmp_path / "goal")
-    goal = yaml.safe_load(path.read_text(encoding="utf-8"))
+    goal = yaml.load(path.read_text(encoding="utf-8"), yaml.CSafeLoader)
     trajectory = goal["trajectory"]
     assert set(goal) == {"trajectory"} and set(trajectory) == {"joint_names", "points"}
     fields = {"positions", "velocities", "accelerations", "effort", "time_from_start"}
@@ -264,7 +264,7 @@ def test_ros2_reads_small_round_numbers_as_numbers(planned: Planned, tmp_path: P
     """YAML takes 1e-05 for text, and 1.0e-05 for a number."""
     small = dataclasses.replace(planned.reference, torque=np.full_like(planned.reference.torque, 1e-5))
     _, path = export_planned(dataclasses.replace(planned, reference=small), "ros2", tmp_path / "goal")
-    points = yaml.safe_load(path.read_text(encoding="utf-8"))["trajectory"]["points"]
+    points = yaml.load(path.read_text(encoding="utf-8"), yaml.CSafeLoader)["trajectory"]["points"]
     assert {x for point in points for x in point["effort"]} == {1e-5}
 
 

@@ -20,8 +20,10 @@ TOUCH = 1.0  # [px] by which extents may meet, as they have some air around thei
 @styled  # how many ticks there are depends on the style's font
 def frowns(figure: Figure) -> list[str]:
     """What is cut by the picture's edge, which texts lie over each other, which legends over data."""
-    for _ in range(2):  # as saving does: a layout of axes of equal scales needs two passes
-        figure.draw_without_rendering()
+    # as saving does: a layout of axes of equal scales needs two passes
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+    figure.draw_without_rendering()
     renderer = figure.canvas.get_renderer()
     boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in _texts(figure)]
     whole = figure.bbox

@@ -196,7 +196,7 @@ def _punch(
     data = _data(drafted, robot, soles, strikers, q, folder)
     # from the start: a push that slides off the target is refused for its replay before its slide is bounded
     data["terms"]["slide"] = {"most_m": Slide().most}
-    data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
+    data, _ = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
     return _draft(data, drafted, robot)
 
 
@@ -232,16 +232,16 @@ def _bolted(
         striking = arms[0]
 
         @cache
-        def data_of(k: int) -> dict[str, Any]:
-            return _strike_data(drafted, robot, strikers, striking, strong[k], hit, edgewise, folder)
+        def strike_of(k: int) -> tuple[dict[str, Any], ImpactProblem]:
+            return _aimed_strike(drafted, robot, strikers, striking, strong[k], hit, edgewise, folder)
 
-        best = _hardest_planned(data_of, strong, folder, say) if planned else None
-        data = data_of(best[0] if best else 0)
+        best = _hardest_planned(lambda k: strike_of(k)[1], strong, say) if planned else None
+        data, problem = strike_of(best[0] if best else 0)
         # more time does not help motors that cannot hold the arm
-        weak = too_weak(_built(data, folder)) if planned and not best else ""
+        weak = too_weak(problem) if planned and not best else ""
         if planned and not best and not weak:
-            best = _hardest_planned(lambda k: _slower(data_of(k)), strong, folder, say)
-            data = _slower(data_of(best[0] if best else 0))
+            best = _hardest_planned(lambda k: _built(_slower(strike_of(k)[0]), folder), strong, say)
+            data = _slower(strike_of(best[0] if best else 0)[0])
         messages = [
             _strike_message(strong, best, tried=planned),
             *([weak] if weak else []),
@@ -254,7 +254,7 @@ def _bolted(
                 robot, arms, q, directions=[tuple(DOWN)] if motion in FROM_ABOVE else STRIKE_DIRECTIONS
             )
             data = {**_data(drafted, robot, [], strikers, q, folder), **hit.data}
-            data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
+            data, _ = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
         except InputError as no_target:
             below = -float(striking_point(robot, arms[0].name, rested(robot))[2])
             if below > 0:
@@ -310,7 +310,7 @@ def _peg(robot: Robot, arm: Arm) -> Tool:
     )
 
 
-def _strike_data(
+def _aimed_strike(
     drafted: Drafted,
     robot: Robot,
     strikers: list[Striker],
@@ -319,8 +319,8 @@ def _strike_data(
     hit: Hit,
     edgewise: bool,
     folder: Path,
-) -> dict[str, Any]:
-    """Data of a bolted arm's strike."""
+) -> tuple[dict[str, Any], ImpactProblem]:
+    """Data of a bolted arm's strike, and its problem."""
     data = {**_data(drafted, robot, [], strikers, strong.start, folder), **hit.data}
     way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
     for phase, bounds in durations(robot, way).items():
@@ -360,7 +360,7 @@ def _stroke(
     say("trying strikes with any part of the hand (compiles the first time)")
     while len(tried) < MAX_STROKES and not any(solved.status.usable for _, solved in tried):
         try:
-            aimed = _aimed(data, name, points, way, folder)
+            aimed, _ = _aimed(data, name, points, way, folder)
         except InputError:
             if not tried:
                 raise
@@ -426,12 +426,12 @@ def _kick(
     data["target"] = {"mass_kg": mass, "body": {"shape": "ball", "size_m": [size]}}
     data["contact"] = {"stiffness_N_m": 2e4, "damping_N_s_m": 20.0}
     points = (np.round([part * hip_height, at[1], size / 2], 3) + 0.0 for part in KICKS)
-    data = _aimed(data, toe.name, points, np.array(STRIKE_DIRECTIONS[0]), folder)
+    data, _ = _aimed(data, toe.name, points, np.array(STRIKE_DIRECTIONS[0]), folder)
     return _draft(data, drafted, robot)
 
 
 def _hardest_planned(
-    data_of: Callable[[int], dict[str, Any]], strong: list[Strong], folder: Path, say: Callable[[str], None]
+    problem_of: Callable[[int], ImpactProblem], strong: list[Strong], say: Callable[[str], None]
 ) -> tuple[int, float] | None:
     """Index of the strike with the hardest motion, of at most `MAX_MOTIONS` that are solved, and the motion's
     objective; None if none is solved.
@@ -447,8 +447,7 @@ def _hardest_planned(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a failed trial is no result
             with contextlib.suppress(InputError):
-                problem = _built(data_of(k), folder)
-                solution = solve(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
+                solution = solve(problem_of(k), options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
                 if solution.status.usable:
                     found.append((sum(solution.objectives.values()), k))
     return (max(found)[1], max(found)[0]) if found else None
@@ -508,7 +507,9 @@ def _data(
     keys["strikers"] = [section_data(StrikerSection, striker) for striker in strikers]
     keys |= {"tools": [section_data(ToolSection, tool) for tool in robot.tools]} if robot.tools else {}
     angles = zip(robot.joint_names, robot.joint_positions(q), robot.hinges, strict=True)
-    keys["postures_rad"] = {START: {joint: round(float(x), 5) for joint, x, hinge in angles if not hinge}}
+    keys["postures_rad"] = {
+        START: {joint: round(float(x), 5) + 0.0 for joint, x, hinge in angles if not hinge}
+    }
     mass = sum(float(body.mass) for body in robot.model.inertias)
     data: dict[str, Any] = {
         "problem": {"name": f"first strike of {robot.name}", "start": START},
@@ -540,8 +541,8 @@ def _data(
 
 def _aimed(
     data: dict[str, Any], striker: str, points: Iterator[Array], way: Array, folder: Path
-) -> dict[str, Any]:
-    """The data with the first hit point for which the checks of a problem pass.
+) -> tuple[dict[str, Any], ImpactProblem]:
+    """The data with the first hit point for which the checks of a problem pass, and the problem.
 
     Raises
     ------
@@ -562,7 +563,7 @@ def _aimed(
         except InputError as error:
             wrong = [str(error)]
         if not wrong:
-            return aimed
+            return aimed, built
         first = first or wrong[0]
     posture, remedy = "the drafted posture", "write the problem file by hand (docs/howto/robot.md)"
     if way[2] < 0:

@@ -202,5 +202,5 @@ def _hits_base(problem: ImpactProblem, impact: EstimatedImpact) -> bool:
     after, moved = np.full(len(travel), 2), np.outer(travel, problem.normal)
     at = Places.of(problem.robot, np.tile(impact.q, (len(travel), 1)), after, moved)
     fixed = {piece.link for piece in bodies_of(problem.robot).pieces if piece.joint == 0}
-    found = problem.bodies.survey(travel, at).touches
+    found = problem.bodies.touches(travel, at)
     return any("target" in (touch.one, touch.other) and {touch.one, touch.other} & fixed for touch in found)

@@ -201,6 +201,18 @@ def _curves(reference: Trajectory, robot: Robot) -> tuple[Array, Array, Array]:
     return np.hstack(values), np.hstack(firsts), np.hstack(seconds)
 
 
+def _quintics(knots: Array, value: Array, first: Array, second: Array) -> BPoly:
+    """Curve (d,) with these values and derivatives (k, d) at its knots (k,), a quintic between each two."""
+    h = np.diff(knots)[:, None]
+    half = [
+        (value[at], sign * h / 5 * first[at], h**2 / 20 * second[at])
+        for at, sign in ((slice(None, -1), 1), (slice(1, None), -1))
+    ]
+    # its Bernstein coefficients, from each end inwards
+    start, end = ([y, y + d, y + 2 * d + dd] for y, d, dd in half)
+    return BPoly(np.stack([*start, *reversed(end)]), knots)
+
+
 def _phase(
     phase: int,
     times: Array,
@@ -214,7 +226,7 @@ def _phase(
     own : indices of the phase's samples in the reference.
     """
     knots = reference.time[own]
-    curve = BPoly.from_derivatives(knots, np.stack([part[own] for part in curves], axis=1))
+    curve = _quintics(knots, *(part[own] for part in curves))
     ground = np.stack([np.interp(times, knots, w) for w in reference.ground[own].T], axis=1)
     force = np.zeros(len(times))
     since = times - reference.contact_start

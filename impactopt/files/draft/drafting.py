@@ -507,9 +507,7 @@ def _data(
     keys["strikers"] = [section_data(StrikerSection, striker) for striker in strikers]
     keys |= {"tools": [section_data(ToolSection, tool) for tool in robot.tools]} if robot.tools else {}
     angles = zip(robot.joint_names, robot.joint_positions(q), robot.hinges, strict=True)
-    keys["postures_rad"] = {
-        START: {joint: round(float(x), 5) + 0.0 for joint, x, hinge in angles if not hinge}
-    }
+    keys["postures_rad"] = {START: {joint: round(float(x), 5) for joint, x, hinge in angles if not hinge}}
     mass = sum(float(body.mass) for body in robot.model.inertias)
     data: dict[str, Any] = {
         "problem": {"name": f"first strike of {robot.name}", "start": START},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -22,8 +22,6 @@ from impactopt.robots.robot import Robot, Sole
 Array = NDArray[np.float64]
 SQUAT = 0.06  # lowering of the hips, over the length of the legs
 LEVEL = 1e-5  # [m], [rad]: tolerance of a sole's placement, to which angles are written and files have axes
-EXACT = 1e-13  # [m], [rad]: an error of zero, but for rounding
-MOST_STEPS = 50  # to such an error; five are the rule
 STARTS = 10  # random initial guesses
 # distances of the soles tried, over that in the zero posture: with splayed legs they may not be level
 WIDTHS = (1.0, 0.9, 0.8)
@@ -226,25 +224,31 @@ def _leg(
     now = robot.joint_positions(q)[own]
     best, nearest = None, np.inf
 
-    def errors(angles: Array) -> tuple[Array, Array]:
-        """Placement error (6,) of the sole, and its derivatives by the angles."""
+    def remaining(angles: Array) -> pin.SE3:
         pin.computeJointJacobians(model, data, _set(robot, q, own, angles))
-        left = pin.updateFramePlacement(model, data, fid).actInv(goal)
+        return pin.updateFramePlacement(model, data, fid).actInv(goal)
+
+    def errors(angles: Array) -> Array:
+        return np.asarray(pin.log6(remaining(angles)).vector)
+
+    def jacobian(angles: Array) -> Array:
+        left = remaining(angles)
         twists = pin.getFrameJacobian(model, data, fid, pin.LOCAL)[:, robot.nv - robot.n + own]
         # the sole moves by exp(twist): exp(-twist) left = left exp(-Ad(left)^-1 twist)
-        jacobian = -pin.Jlog6(left) @ left.toActionMatrixInverse() @ twists
-        return np.asarray(pin.log6(left).vector), jacobian
+        return np.asarray(-pin.Jlog6(left) @ left.toActionMatrixInverse() @ twists)
 
     for k in range(2 * STARTS):
         start = np.clip(now + (0.6 * rng.standard_normal(len(own)) if k else 0.0), low, high)
-        angles = _least_squares(errors, start, low, high)
-        off = float(np.abs(errors(angles)[0]).max())
+        found = least_squares(
+            errors, start, jacobian, bounds=(low - 1e-9, high + 1e-9), xtol=1e-14, ftol=1e-14, gtol=1e-14
+        )
+        off = float(np.abs(errors(found.x)).max())
         nearest = min(nearest, off)
         if off > LEVEL:
             continue
         knee = max(float(data.oMi[j].translation @ forward) for j in joints)
         if best is None or knee > best[0] + 1e-4:
-            best = knee, angles
+            best = knee, found.x
     if best is None:
         names = [model.names[j] for j in joints]
         raise InputError(
@@ -252,30 +256,6 @@ def _leg(
             f" {nearest:.2g} m or rad off; give postures by hand (docs/howto/robot.md)"
         )
     return _set(robot, q, own, best[1])
-
-
-def _least_squares(
-    errors: Callable[[Array], tuple[Array, Array]], at: Array, low: Array, high: Array
-) -> Array:
-    """Variables (n,) within bounds at which errors vanish, or are least nearby, by Levenberg and Marquardt.
-
-    For six errors SciPy's `least_squares` takes ten times as long.
-
-    errors : maps variables to errors (m,) and their derivatives (m, n).  at (n,) : initial guess.
-    """
-    damping = 1e-3
-    error, jacobian = errors(at)
-    for _ in range(MOST_STEPS):
-        if np.abs(error).max() < EXACT:
-            break
-        step = np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(len(at)), -jacobian.T @ error)
-        trial = np.clip(at + step, low, high)
-        new, derivatives = errors(trial)
-        if new @ new < error @ error:
-            at, error, jacobian, damping = trial, new, derivatives, damping / 10
-        else:
-            damping *= 10
-    return at
 
 
 def _columns(robot: Robot, joints: Sequence[int]) -> NDArray[np.intp]:

@@ -239,6 +239,10 @@ class ContactProgram(ABC):
         add_springs(self.builder, self._spring_points(), self.hit.contact.gains[0])
         if self.builder.robot.hinges.any():
             add_hinges(self.builder, [(place, torque) for place, torque, _ in self._nodes()])
+        # after the contact's constraints, which determine the target's motion
+        displacement = TargetDisplacement(self.builder, self.expected)
+        self.displacements = self._displacements(displacement)
+        displacement.add_constraints()
         for term in terms:
             # the parts have the constraints of the other terms
             if type(term).add_constraints is not Term.add_constraints:
@@ -247,9 +251,6 @@ class ContactProgram(ABC):
                 self.constraints.measured(since, term.name, term.unit)
                 if not kind_of(term, Term).__module__.startswith("impactopt."):
                     self._check_own(type(term).__name__, since, before)
-        displacement = TargetDisplacement(self.builder, self.expected)
-        self.displacements = self._displacements(displacement)
-        displacement.add_constraints()
         # In the order of a problem file, as terms are.
         self.objectives = quantities(self, in_order(objectives, OBJECTIVES))
         self._objective = assemble(self.layout, self.objectives, self._prices())

@@ -326,7 +326,7 @@ def test_links_that_fit_into_each_other_touch(apart: float, touch: bool) -> None
 
     def distance_at(elbow: float) -> float:
         q[3] = elbow
-        return bodies.exact(Places.of(problem.robot, q[None], np.zeros(1), np.zeros(1, np.intp)), 0, pair)
+        return bodies.exact(Places.of(problem.robot, q[None], np.zeros(1, np.intp)), 0, pair)
 
     q[3] = brentq(lambda elbow: distance_at(elbow) - apart, 1.2, 3.1)
     pairs, touching = bodies.links.piece_pairs(q)

@@ -409,7 +409,8 @@ def test_a_clearance_is_to_the_target_where_it_is_in_the_replay(velocity: float)
     away = simulate(problem, ref, engine="mujoco", settle=0.0, perturbation=world)
     assert away.clearance == pytest.approx(still.clearance + 0.02, abs=1e-5)
     bodies = problem.bodies
-    at = Places.of(robot, q[None], np.array([-velocity * (0.1 - still.time[-1])]), np.zeros(1, dtype=np.intp))
+    came = -velocity * (0.1 - still.time[-1]) * problem.normal
+    at = Places.of(robot, q[None], np.zeros(1, dtype=np.intp), came[None])
     assert still.clearance == pytest.approx(bodies.survey(np.zeros(1), at).clearance, abs=1e-5)
 
 

@@ -129,7 +129,7 @@ def test_torques_that_cannot_be_held_are_told_with_joint_and_time(arm_transcript
     model, joints = t.robot.model, list(t.robot.joint_names)
     swing = t.swing.spline(result.x)
     checked = 0
-    for violation in told(t, result.x):
+    for violation in told(t, result.x, count=t.program.m):
         said = re.fullmatch(
             r"torque limit, swing at ([\d.]+) s, (\w+): (\d+) % over its limit", str(violation)
         )
@@ -155,7 +155,7 @@ def test_a_point_that_is_out_of_time_is_told_in_millimetres(arm_transcription: T
     data, q = model.createData(), t.coordinates.join(swing.sample(swing.duration)[0][0], t.legs0)
     pin.framesForwardKinematics(model, data, q)
     at = data.oMf[model.getFrameId(f"striker:{t.problem.striker}")].translation
-    for violation in told(t, result.x):
+    for violation in told(t, result.x, count=t.program.m):
         if said := re.fullmatch(r"hit point, ([xyz]): ([\d.]+) mm away", str(violation)):
             off = abs(at - t.problem.point)
             assert "xyz"[int(np.argmax(off))] == said[1]

@@ -100,14 +100,19 @@ def check_kind(name: str, given: object, kind: type) -> None:
 
 
 def named_table(given: Any) -> Any:
-    """A pandas Series by names as a dict; anything else as it is.
+    """A pandas Series by names as a dict; anything else as it is. InputError if it has a name twice.
 
     As an array, it would count in its own order.
     """
     if isinstance(given, Mapping) or not hasattr(given, "keys") or getattr(given, "ndim", 0) != 1:
         return given
     table = dict(given.items())
-    return table if table and all(isinstance(name, str) for name in table) else given
+    if not table or not all(isinstance(name, str) for name in table):
+        return given
+    if len(table) < len(given):
+        twice = next(name for name in table if list(given.keys()).count(name) > 1)
+        raise InputError(f"a table names {twice!r} twice: give one value for it")
+    return table
 
 
 def missing_package(what: str, package: str, extra: str) -> InputError:

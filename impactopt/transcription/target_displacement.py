@@ -52,7 +52,10 @@ class TargetDisplacement:
     def __init__(self, b: Builder, hit: Collision | InstantImpact) -> None:
         p = b.problem
         self._b, self._hit, self._sums = b, hit, list[_Sum]()
-        self._moves = p.keeps_apart and any(body.moves for body in p.bodies.world)
+        moving = [body for body in p.bodies.world if body.moves] if p.keep_out.enabled else []
+        self._moves = bool(moving)
+        # a board is not there any more once contact begins
+        self._moves_on = not all(body.before for body in moving)
         across = isinstance(hit, Collision) and hit.tangential.size > 0
         self._labels = ["along the normal", *(f"across it, {axis}" for axis in "xyz" * across)]
         self._axes: Array = _UNIT * np.column_stack([p.normal, np.eye(3)[:, : 3 * across]])
@@ -65,14 +68,14 @@ class TargetDisplacement:
 
     def in_contact(self, stage: int, place: Place) -> Affine:
         """Displacement at a collocation point."""
-        if not self._moves or not isinstance(self._hit, Collision):
+        if not self._moves_on or not isinstance(self._hit, Collision):
             return Affine.zeros(3)
         base = self._end(self._hit.stages[stage].phase)
         return self._add(place, base, *self._hit.target_moved(stage)).apply(self._axes)
 
     def after(self, since: Affine | None, place: Place) -> Affine:
         """Displacement at this time [s] after contact; None: at its end."""
-        if not self._moves:
+        if not self._moves_on:
             return Affine.zeros(3)
         base = self._end(len(self._hit.phases))
         if since is not None and not self._b.problem.target.stays:

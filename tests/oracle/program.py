@@ -277,11 +277,11 @@ class Program:
     def _displacements(self) -> dict[str, Callable[[Variables], Array]]:
         """Displacement (3,) [m] of the target at each node of all phases, by its place; adds its rows."""
         p, term = self.problem, "displacement of the target"
-        moves = p.keeps_apart and any(body.moves for body in p.bodies.world)
+        moving = [body for body in p.bodies.world if body.moves] if p.keep_out.enabled else []
         rubbed = p.friction is not None and p.friction.moves_target
         labels = ["along the normal", *(f"across it, {x}" for x in "xyz" if rubbed)]
         axes = UNIT * np.column_stack([p.normal, *(np.eye(3) if rubbed else ())])
-        before, still = float(p.target.speed_before()) * moves * p.normal, np.zeros(len(labels))
+        before, still = float(p.target.speed_before()) * bool(moving) * p.normal, np.zeros(len(labels))
 
         def known(v: Variables, time: Callable[[Variables], float]) -> Array:
             return -before * time(v)
@@ -291,7 +291,7 @@ class Program:
         }
         others = [*self._since(1), *(self._since(2) if len(self.courses) > 2 else ())]
         out |= {place: lambda v: np.zeros(3) for place, _ in others}
-        if not moves:
+        if all(body.before for body in moving):  # nothing moves, or a board, which the impact takes away
             return out | {self.blows[0].place(i): out[others[0][0]] for i in range(self._stages)}
         if not self.blows:  # what its displacements are, is not known: they are taken for right
             first = f"{term}, end of {spells_of(p)[-1].name}"

@@ -334,6 +334,9 @@ def _bodies(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
         )
     for times, postures, phases, n in parts:
         shifts = np.zeros((len(times), 3))
+        if n == 0:  # it comes at a constant speed
+            before = float(p.problem.target.speed_before()) * (times - _start(p, v))
+            shifts = np.outer(before, p.problem.normal)
         if n == 2:
             since = times - float(arrays["reference_contact_end"])
             shifts = np.outer(gone + speed * since, p.problem.normal) + across + np.outer(since, drift)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from support.small_plans import Planned, arm_problem, biped_problem, changed, transcribed
 
@@ -40,6 +41,7 @@ from impactopt import (
     solve,
     space_arm,
 )
+from impactopt.bodies.clearance import Places
 from impactopt.files.output import record_of
 from impactopt.planning.clearance_constraints import Margins, Watch
 from impactopt.robots.couplings import Tendon
@@ -318,6 +320,30 @@ def test_of_an_objective_that_is_not_linear(objective: Objective) -> None:
     """The peak force has the force at first touch of the damped law."""
     p = load_problem(PROBLEMS / "arm_planar.toml")
     check_rows(transcribed(dataclasses.replace(p, objectives=(*p.objectives, objective))))
+
+
+def test_a_ball_that_comes_is_not_yet_at_its_place_in_the_record() -> None:
+    """A posture that would penetrate it at contact is right long before."""
+    t = transcribed(dataclasses.replace(arm_problem(), target=FreeMass(mass=0.5, initial_velocity=-3.0)))
+    problem, x = t.problem, first_iterate(t)
+    program, v = second(t, x)
+    trajectory, rng = t.decode(x).trajectory(), np.random.default_rng(0)
+    depth = 0.0
+    while not depth > 0.01:  # in the ball, and in nothing else
+        q = pin.integrate(problem.robot.model, problem.start_posture, rng.uniform(-1.0, 1.0, problem.robot.n))
+        touches = problem.bodies.survey(
+            np.zeros(1), Places.of(problem.robot, q[None], np.zeros(1, dtype=np.intp))
+        ).touches
+        depth = (
+            touches[0].depth if len(touches) == 1 and "target" in (touches[0].one, touches[0].other) else 0.0
+        )
+    arrays = {f"reference_{f.name}": getattr(trajectory, f.name) for f in fields(Trajectory)}
+    swing = np.flatnonzero(trajectory.phase == 0)
+    for k, off in ((swing[-1], depth), (swing[0], 0.0)):
+        arrays["reference_q"] = np.tile(problem.start_posture, (len(trajectory.q), 1))
+        arrays["reference_q"][k] = q
+        found = [each.amount for each in off_in_record(program, v, arrays, {}) if "distance" in each.name]
+        assert max(found) == pytest.approx(off, abs=5e-3)
 
 
 @pytest.mark.slow

@@ -646,3 +646,12 @@ def test_a_table_by_joint_may_be_a_pandas_series() -> None:
     # without names it is an array
     kp = pandas.Series([1.0, 2.0, 3.0])
     np.testing.assert_array_equal(planar_arm(kp=kp).kp, kp)
+
+
+def test_a_pandas_series_that_names_a_joint_twice_is_refused() -> None:
+    """Of two tables that are joined, the later one's number was taken."""
+    pandas = pytest.importorskip("pandas")
+    joined = pandas.concat([pandas.Series({"elbow": 100.0, "wrist": 50.0}), pandas.Series({"wrist": 5.0})])
+    for made in (lambda: planar_arm(kp=joined), lambda: scaled_gains(planar_arm(), joined)):
+        with pytest.raises(InputError, match="names 'wrist' twice"):
+            made()

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 from support.small_plans import arm_problem, biped_problem, transcribed
 
-from impactopt import ContactFriction, FreeMass, Phase, RigidWall, Scenario, StancePhase, TargetBody, solve
+from impactopt import (
+    Board,
+    ContactFriction,
+    FreeMass,
+    Phase,
+    RigidWall,
+    Scenario,
+    StancePhase,
+    TargetBody,
+    solve,
+)
 from impactopt.bodies.clearance import MISSED
 from impactopt.planning.clearance_constraints import node_placements
 from impactopt.planning.solution import program_of
@@ -63,9 +73,18 @@ def test_the_target_moves_on_in_later_stance_phases_and_comes_in_earlier_ones() 
 
 
 @pytest.mark.parametrize(
-    "changes", [{"target": RigidWall()}, {"body": TargetBody(shape="none")}, {"terms": OFF}]
+    "changes",
+    [
+        {"target": RigidWall()},
+        {"body": TargetBody(shape="none")},
+        {"terms": OFF},
+        {"terms": OFF[:1]},
+        {"target": Board(mass=0.3, stiffness=1e5, breaking_force=900.0)},
+    ],
 )
-def test_where_no_body_moves_with_the_target_there_are_no_such_variables(changes: dict[str, Any]) -> None:
+def test_where_no_body_moves_with_the_target_after_contact_there_are_no_such_variables(
+    changes: dict[str, Any],
+) -> None:
     t = transcribed(dataclasses.replace(arm_problem(), **changes))
     assert not [name for name in t.layout.groups if name.startswith(TERM)]
     assert not node_placements(t, first_iterate(t)).at.displacement.any()

@@ -103,11 +103,19 @@ def named_table(given: Any) -> Any:
     """A pandas Series by names as a dict; anything else as it is.
 
     As an array, it would count in its own order.
+
+    Raises
+    ------
+    InputError : a name that it has twice.
     """
     if isinstance(given, Mapping) or not hasattr(given, "keys") or getattr(given, "ndim", 0) != 1:
         return given
-    table = dict(given.items())
-    return table if table and all(isinstance(name, str) for name in table) else given
+    table, names = dict(given.items()), list(given.keys())
+    if not table or not all(isinstance(name, str) for name in names):
+        return given
+    if twice := [name for name in table if names.count(name) > 1]:
+        raise InputError(f"a table by name has {twice[0]!r} twice: keep one of them")
+    return table
 
 
 def missing_package(what: str, package: str, extra: str) -> InputError:

@@ -646,3 +646,5 @@ def test_a_table_by_joint_may_be_a_pandas_series() -> None:
     # without names it is an array
     kp = pandas.Series([1.0, 2.0, 3.0])
     np.testing.assert_array_equal(planar_arm(kp=kp).kp, kp)
+    with pytest.raises(InputError, match="has 'wrist' twice"):
+        planar_arm(kp=pandas.Series([1.0, 2.0, 3.0], index=["wrist", "elbow", "wrist"]))

@@ -100,9 +100,13 @@ def check_kind(name: str, given: object, kind: type) -> None:
 
 
 def named_table(given: Any) -> Any:
-    """A pandas Series by names as a dict; anything else as it is. InputError if it has a name twice.
+    """A pandas Series by names as a dict; anything else as it is.
 
     As an array, it would count in its own order.
+
+    Raises
+    ------
+    InputError : a name that it has twice.
     """
     if isinstance(given, Mapping) or not hasattr(given, "keys") or getattr(given, "ndim", 0) != 1:
         return given

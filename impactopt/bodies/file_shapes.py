@@ -38,13 +38,13 @@ class LinkShape:
 def urdf_elements(urdf: str | None, tag: str) -> list[ElementTree.Element]:
     """Elements of a URDF with this tag; none without a URDF, or if it cannot be read."""
     try:
-        return [] if urdf is None else _parsed(urdf, Path(urdf).stat().st_mtime_ns).findall(tag)
+        return [] if urdf is None else _parsed(urdf, Path(urdf).read_bytes()).findall(tag)
     except (OSError, InputError):
         return []
 
 
 @lru_cache(maxsize=1)
-def _parsed(urdf: str, _changed: int) -> ElementTree.Element:
+def _parsed(urdf: str, _content: bytes) -> ElementTree.Element:
     return parse_urdf(urdf)
 
 

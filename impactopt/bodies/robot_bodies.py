@@ -35,10 +35,12 @@ class RobotBodies:
     """Collision geometry of a robot.
 
     pieces : exact hulls of links.  source : description of their source.
+    rest (nq,) : configuration with all joints at or near zero.
     too_large : shapes of its file that are left out, as they are too large.
     """
 
-    robot: Robot
+    model: pin.Model  # not the robot, which the cache of `bodies_of` would keep for ever
+    rest: Array
     pieces: tuple[Piece, ...]
     source: str
     too_large: tuple[Piece, ...] = ()
@@ -69,7 +71,7 @@ class RobotBodies:
     @cached_property
     def connected(self) -> tuple[Pair, ...]:
         """Pairs of a joint and its parent that both move pieces: their bodies always touch."""
-        parents = ((j, parent_body(self.robot.model, j)) for j in self.joints)
+        parents = ((j, parent_body(self.model, j)) for j in self.joints)
         return tuple((j, parent) for j, parent in parents if parent in self.joints)
 
     @cached_property
@@ -103,7 +105,7 @@ class RobotBodies:
     @cached_property
     def _chains(self) -> list[set[int]]:
         """Joints from the root to each joint."""
-        return [set(joints) for joints in self.robot.model.supports]
+        return [set(joints) for joints in self.model.supports]
 
     def piece_pairs(
         self, q: Array, disabled: Iterable[frozenset[str]] = ()
@@ -131,7 +133,7 @@ class RobotBodies:
     def _piece_pairs(
         self, q: Array, excluded: frozenset[frozenset[str]]
     ) -> tuple[dict[Pair, tuple[tuple[Piece, Piece], ...]], list[tuple[str, str]]]:
-        model, data = self.robot.model, self.robot.model.createData()
+        model, data = self.model, self.model.createData()
         pin.forwardKinematics(model, data, q)
         places = {j: transform(data.oMi[j].rotation, data.oMi[j].translation) for j in self.joints}
         out: dict[Pair, tuple[tuple[Piece, Piece], ...]] = {}
@@ -178,9 +180,7 @@ class RobotBodies:
 
     @cached_property
     def _touching_at_rest(self) -> list[tuple[str, str]]:
-        robot, rest = self.robot, neutral(self.robot.model)
-        angles = np.clip(robot.joint_positions(rest), robot.lower, robot.upper)
-        return self.piece_pairs(robot.angles.put(rest, angles))[1]
+        return self.piece_pairs(self.rest)[1]
 
 
 _KNOWN: weakref.WeakKeyDictionary[Robot, RobotBodies] = weakref.WeakKeyDictionary()
@@ -192,7 +192,11 @@ def bodies_of(robot: Robot) -> RobotBodies:
         known = file_pieces(robot)
         pieces, source = pieces_of(robot, known)
         too_large = tuple(p for p in known if is_too_large(robot.model, p.joint, p.vertices))
-        _KNOWN[robot] = RobotBodies(robot=robot, pieces=pieces, source=source, too_large=too_large)
+        zero = neutral(robot.model)
+        rest = robot.angles.put(zero, np.clip(robot.joint_positions(zero), robot.lower, robot.upper))
+        _KNOWN[robot] = RobotBodies(
+            model=robot.model, rest=rest, pieces=pieces, source=source, too_large=too_large
+        )
     return _KNOWN[robot]
 
 

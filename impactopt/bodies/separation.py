@@ -115,7 +115,7 @@ class Shapes:
         keys: list[Any] = [*own, *(("world", w) for w in range(len(corners)))]
         where = dict(zip(keys, ranges, strict=True))
         # work memory of the C code
-        self.room = np.zeros(len(self.points) + 4 * len(self.of) + links.robot.model.njoints + 1)
+        self.room = np.zeros(len(self.points) + 4 * len(self.of) + links.model.njoints + 1)
         piece_index = {id(piece): k for k, piece in enumerate(links.pieces)}
         pairs, number, hulls, pieces_of, radius = [], [], [], [], []
         for (a, b), pieces in pairs_of_links.items():
@@ -138,7 +138,7 @@ class Shapes:
         self.hulls = np.array(hulls, dtype=np.int64).reshape(-1, 4)
         self.radius = np.array(radius, dtype=float)
         self.pieces = np.array(pieces_of, dtype=np.int64).reshape(-1, 2)
-        everything = links.robot.model.njoints  # a body of the world is no neighbour
+        everything = links.model.njoints  # a body of the world is no neighbour
         self.between = np.array([links.joints_between(a, b) if b >= 0 else everything for a, b in pairs])
         self.index = {(a, b, k): n for n, ((a, b), k) in enumerate(zip(pairs, number, strict=True))}
 

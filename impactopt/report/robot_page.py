@@ -80,7 +80,7 @@ def _page(
         title=f"{title}: bodies",
         heading=title,
         about=f"{robot.name}: collision bodies",
-        parts=_parts(links, q, posture, world),
+        parts=_parts(robot, q, posture, world),
         header=header,
         arrays=arrays,
     )
@@ -116,7 +116,8 @@ def _still(robot: Robot, q: Array, label: str) -> Track:
     )
 
 
-def _parts(links: RobotBodies, q: Array, posture: str, world: Sequence[WorldBody]) -> Iterator[str]:
+def _parts(robot: Robot, q: Array, posture: str, world: Sequence[WorldBody]) -> Iterator[str]:
+    links = bodies_of(robot)
     yield f'<p id="source">Bodies are convex hulls of the {escape(links.source)}. Point at a row to see its '
     yield "link.</p>"
     yield '<div class="top"><section class="card stays" id="animation" aria-label="bodies"></section>'
@@ -125,7 +126,7 @@ def _parts(links: RobotBodies, q: Array, posture: str, world: Sequence[WorldBody
     if world:
         yield f'<h2>The world</h2><section class="card" id="world">{_world(world)}</section>'
     yield "<h2>Pairs that may touch</h2>"
-    for number, (why, pairs) in enumerate(_excluded_pairs(links, q, posture)):
+    for number, (why, pairs) in enumerate(_excluded_pairs(robot, q, posture)):
         yield f'<section class="card left-out" id="why{number}"><h3>{escape(why)}</h3>'
         yield f"{_table(('link', 'and link'), pairs or [('none', '')])}</section>"
 
@@ -152,11 +153,9 @@ def _world(world: Sequence[WorldBody]) -> str:
     )
 
 
-def _excluded_pairs(
-    links: RobotBodies, q: Array, posture: str
-) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+def _excluded_pairs(robot: Robot, q: Array, posture: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
     """Reasons why pairs of links may touch, with the pairs."""
-    robot = links.robot
+    links = bodies_of(robot)
     yield "A joint connects them", [(links.name(a), links.name(b)) for a, b in links.connected]
     disabled = {frozenset(pair) for pair in robot.disable_collisions}
     joints = {hull.link: hull.joint for hull in links.pieces}

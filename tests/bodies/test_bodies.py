@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
+import os
 import re
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -388,6 +391,28 @@ def test_the_target_comes_goes_and_moves() -> None:
     np.testing.assert_allclose(after - before, moved[2], atol=1e-12)
     np.testing.assert_allclose(free.placed(places).world[2, w, 9:] - before, moved[2], atol=1e-12)
     assert free.present(free.world[w], places).tolist() == [True, True, True, False]
+
+
+def test_the_bodies_of_a_robot_do_not_outlive_it() -> None:
+    """A sweep of many robots has the memory of one."""
+    robot = planar_arm()
+    freed = weakref.ref(robot)
+    assert bodies_of(robot).overlaps([]) == set()
+    del robot
+    gc.collect()
+    assert freed() is None
+
+
+def test_a_file_whose_time_of_change_is_set_back_is_read_again(tmp_path: Path) -> None:
+    """As by an archive's tool: the new shapes count."""
+    file, found = tmp_path / "robot.urdf", []
+    for width in (0.08, 0.5):
+        assert "0.08 0.08 0.3" in urdfs.arm()
+        file.write_text(urdfs.arm().replace("0.08 0.08 0.3", f"{width} 0.08 0.3", 1), "utf-8")
+        os.utime(file, (1e9, 1e9))
+        pieces = bodies_of(Robot.from_urdf(file)).pieces
+        found.append(max(np.ptp(piece.vertices[:, 0]) for piece in pieces))
+    assert found[0] < 0.5 <= found[1]
 
 
 # ---- the world

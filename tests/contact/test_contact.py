@@ -603,3 +603,21 @@ def test_a_law_that_does_not_take_its_numbers_as_inputs_is_refused():
         Parting(stiffness=1e4, dissipation=0.0)
     with pytest.raises(InputError, match="Undecorated is no dataclass: write @dataclass"):
         _ = Undecorated().parameters
+
+
+def test_a_law_has_the_branches_of_its_constants_today():
+    @dataclasses.dataclass(frozen=True)
+    class Lossy(ContactLaw):
+        stiffness: float = 1e4
+        damping: float = 10.0
+        returned = 1.0  # fraction of the damping in restitution
+
+        def branch(self, penetration, rate, compressing, parameters=None):
+            numbers = parameters or self.parameters
+            damping = numbers["damping"] * (1.0 if compressing else self.returned)
+            return numbers["stiffness"] * penetration + damping * rate
+
+    law = Lossy()
+    assert not law.switches
+    Lossy.returned = 0.5
+    assert law.switches and law.force(1e-3, -0.1) == pytest.approx(9.5)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -97,7 +97,7 @@ class ContactLaw(Described, ABC):
         """
         return numbers_of(self)
 
-    @cached_property  # a program of one touch asks a dozen times
+    @property
     def switches(self) -> bool:
         """True if compression and restitution are different branches."""
         compression, restitution, _ = self.formula()

@@ -22,6 +22,7 @@ from impactopt import (
     Plan,
     Scenario,
     StancePhase,
+    TargetBody,
     Trajectory,
     load_problem,
 )
@@ -127,7 +128,9 @@ def test_an_initial_guess_has_no_straight_leg_at_contact() -> None:
 def test_a_leg_of_an_initial_guess_bends_as_at_the_start() -> None:
     """The contact posture has the knee of the standing leg just behind the straight leg."""
     problem = load_problem("kick_g1")
-    problem = dataclasses.replace(problem, point=problem.point + np.array([-0.1, 0.0, 0.44]))
+    # without a target's body, which would be in the leg at the start
+    point, body = problem.point + np.array([-0.1, 0.0, 0.44]), TargetBody(shape="none")
+    problem = dataclasses.replace(problem, point=point, body=body)
     c = problem.coordinates
     assert c.leg_extension(c.split(problem.contact_posture)[1]).min() < 0
     assert c.leg_extension(reached(transcribed(problem)).legs).min() > 0

@@ -74,7 +74,7 @@ def program_of_record(record: Record, problem: ImpactProblem) -> Transcription |
     t = program_on(problem, nodes, elements, tuple(statement.get("shares", ())))
     clearances = {
         ClearanceKey(*(entry[key] for key in ClearanceKey._fields)): SeparatingDirection(
-            tuple(entry["vector"]), *(entry[key] for key in SeparatingDirection._fields[1:] if key in entry)
+            tuple(entry["vector"]), entry["least_distance"]
         )
         for entry in statement["clearance"]
     }

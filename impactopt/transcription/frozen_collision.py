@@ -61,6 +61,7 @@ class InstantImpact:
     du : change of the rate ydot.
     impulse : to the target [N s].
     w : impulsive sole wrenches [N s, N m s].
+    phases : of a contact with a duration; none.
     """
 
     phases = ()

@@ -31,6 +31,7 @@ from impactopt.kinematics.stance import OneSole
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.build import locked_angles
 from impactopt.robots.checks import GIVEN
 from impactopt.robots.robot import Robot, Sole
 
@@ -84,8 +85,8 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
         data["floating"] = options["floating"]
     if "gravity" in options:
         data["gravity_m_s2"] = plain_value(options["gravity"])
-    locked = named_table(options.get("locked", ()))
-    angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
+    locked = options.get("locked", ())
+    angles = locked_angles(locked)
     if angles or (locked != () and source.preset is not None):
         data["locked_rad"] = plain_value(angles)
     for name in BY_JOINT:

@@ -373,3 +373,11 @@ def test_segments_begin_with_elements() -> None:
     # a boundary of segments that is next to a phase's end gives way to it
     lengths = contact_elements(problem, (0.399, 0.601))
     assert min(h for phase in lengths for h in phase) > 0.02
+
+
+@pytest.mark.parametrize("mass", [3.6, 3.8])
+def test_a_mass_is_not_called_infeasible_between_two_that_are_solved(mass: float) -> None:
+    problem = dataclasses.replace(arm_problem(), collision="sdc", target=FreeMass(mass=mass))
+    # 3.4 and 4 kg were solved, and the constraints of these were met to 5e-5 on the way to a point where
+    # their violation, of 1e-2, is stationary
+    assert solve(problem).status is Status.SOLVED

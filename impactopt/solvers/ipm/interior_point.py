@@ -374,6 +374,8 @@ class InteriorRun(Run[IPMOptions]):
                 status = self._iterate(remark)
             finally:
                 self._problem.release()
+            if status is Status.INFEASIBLE and self._was_nearer():
+                status = Status.FAILED
             # An infeasible program, a limit or an interruption is an outcome; only a
             # failure is worth another attempt.
             if status is not Status.FAILED or restarts == _MAX_RESTARTS or not self._back_to_best():
@@ -413,6 +415,10 @@ class InteriorRun(Run[IPMOptions]):
         self.point, self._state = self._problem.point, None
         self._phase.begin()
         self._search.reset_filter()
+
+    def _was_nearer(self) -> bool:
+        """True if an iterate before had far less violation: that of the present point is not the least."""
+        return self.report.best.violation < _HARD_FRACTION * self.point.max_violation
 
     def _back_to_best(self) -> bool:
         """Move to the best iterate, without multipliers, as these may have led to the failure.

@@ -31,7 +31,7 @@ from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.clearance_constraints import Margins, deepest_penetration
 from impactopt.planning.lazy_constraints import slides_beyond, with_lazy_constraints
 from impactopt.planning.parameter_changes import changed, with_parameter
-from impactopt.planning.refinement import program_for
+from impactopt.planning.refinement import program_for, start_of
 from impactopt.problem.checks import met_once
 from impactopt.problem.feasibility import too_weak
 from impactopt.problem.problem import ImpactProblem
@@ -125,6 +125,8 @@ class _CauseSearch:
         # initial guesses: the failed solve's last point, and the problem's own with typical durations
         self.guesses = own, first_iterate(program_for(self.t, typical))
         self.bounds = bounds_of(self.t)
+        # programs of the problem with one bound changed, and their solutions (n,)
+        self._near: list[tuple[Transcription, Array]] = []
 
     def found(self) -> Search:
         relaxed = self._all_relaxed()
@@ -148,6 +150,11 @@ class _CauseSearch:
             causes += self._clearances(candidates, x)
         if not any(cause.problem for cause in causes):
             causes += self._stiffness()
+        # A motion within a changed bound may lead to one within the given ones: then nothing had to change.
+        for near in self._near[:1]:
+            result = self._run(self.t.program, start_of(self.t, *near), _ITERATIONS_SINGLE)
+            if result is not None and not _penetrates(self.t, result.x):
+                return Search(met=(self.t, result.x))
         # Stable: those that would do come first, in the order found.
         causes.sort(key=lambda cause: cause.problem is None)
         return Search(causes=tuple(causes))
@@ -178,6 +185,7 @@ class _CauseSearch:
             self._iterations += _ITERATIONS_CHANGED
             solution = self._solution(one.problem, _ITERATIONS_CHANGED)
             if solution is not None and not _penetrates(*solution):
+                self._near.append(solution)
                 return replace(one, nearer=None)
         return replace(cause, nearer=None) if cause.problem is None else None
 

@@ -25,6 +25,7 @@ from impactopt import (
     Phase,
     Scenario,
     Solution,
+    SpringDamper,
     Status,
     TorqueLimit,
     load_problem,
@@ -57,13 +58,12 @@ def changes(arm: ImpactProblem) -> dict[str, tuple[ImpactProblem, str]]:
     return {
         "hard wood": (dataclasses.replace(arm, target=wood), "gears"),
         "short swing": (dataclasses.replace(arm, swing=Phase(duration=0.02)), "time"),
-        "long swing": (dataclasses.replace(arm, swing=Phase(duration=50.0)), "time"),
         "soft contact": (dataclasses.replace(arm, law=law, swing=few), "a soft contact"),
     }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["hard wood", "short swing", "long swing", "soft contact"])
+@pytest.mark.parametrize("name", ["hard wood", "short swing", "soft contact"])
 def test_the_bound_that_is_named_is_the_one_that_has_to_move(arm: ImpactProblem, name: str) -> None:
     problem, first = changes(arm)[name]
     t, result, found = searched(problem)
@@ -75,6 +75,15 @@ def test_the_bound_that_is_named_is_the_one_that_has_to_move(arm: ImpactProblem,
     )
     assert cause.problem is not None
     assert solve(cause.problem).status.usable
+
+
+@pytest.mark.slow
+def test_no_problem_is_called_infeasible_that_is_solved_from_its_neighbour(arm: ImpactProblem) -> None:
+    """Here a swing of 18.1 s, and a follow-through of 0.848 s in place of 0.8 s, were said to be needed."""
+    stiff = SpringDamper(stiffness=1e5, damping=300.0 * 10**0.5)
+    heavy = dataclasses.replace(arm_problem(), target=FreeMass(mass=6.5), law=stiff)
+    for problem in (heavy, dataclasses.replace(arm, swing=Phase(duration=50.0))):
+        assert solve(problem).status is Status.SOLVED
 
 
 def test_a_scenario_may_be_called_as_a_phase_begins() -> None:

@@ -28,27 +28,15 @@ Source: S. P. Norsett, "Restricted Pade approximations to the exponential functi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from math import comb
-from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import roots_laguerre
 
-from impactopt.collision.stepped import contact_functions, law_is_linear, target_is_linear
-from impactopt.contact import ContactLaw, Target
-
 Array = NDArray[np.float64]
-
-# subintervals of [0, 1] shorter than this are not subdivided further
-_SHORTEST_INTERVAL = 2.0**-50
-# relative rounding error of the coefficients of a subdivided polynomial
-_SUBDIVISION_ROUNDING = 1e-14
 
 
 def bernstein_matrix(degree: int) -> Array:
@@ -60,55 +48,6 @@ def bernstein_matrix(degree: int) -> Array:
     return np.array([[comb(i, k) / comb(degree, k) if k <= i else 0.0 for k in n] for i in n])
 
 
-def first_negative(b: Array, start: float = 0.0, length: float = 1.0) -> float | None:
-    """First point at which a polynomial becomes negative, or None, from its Bernstein coefficients.
-
-    The interval is [start, start + length]. The polynomial lies in the convex hull of its coefficients and
-    has at most as many roots as they have sign changes (Lane and Riesenfeld, BIT 21 (1981) 112-117). The
-    interval is halved until this decides.
-    """
-    if (b >= 0).all():
-        return None
-    if b[0] < 0 or (b <= 0).all():
-        return start
-    if length < _SHORTEST_INTERVAL:
-        return start if b[-1] < 0 else None
-    signs = np.sign(b[b != 0])
-    if b[0] > 0 and b[-1] < 0 and (np.diff(signs) != 0).sum() == 1:
-        # one sign change: exactly one root
-        root = brentq(lambda s: _halves(b, s)[0][-1], 0.0, 1.0, xtol=1e-18, rtol=1e-15)
-        return start + length * float(root)
-    left, right = _halves(b, 0.5)
-    found = first_negative(left, start, length / 2)
-    return first_negative(right, start + length / 2, length / 2) if found is None else found
-
-
-def largest(b: Array, end: float, least: float) -> float:
-    """Maximum of `least` and of a polynomial on [0, end], up to rounding, from its Bernstein coefficients.
-
-    The largest coefficient is an upper bound of the values. It converges to their maximum with the square of
-    the subintervals' length.
-    """
-    if b.max() <= least + _SUBDIVISION_ROUNDING * np.abs(b).max():
-        return least
-    b = _halves(b, end)[0] if end < 1.0 else b
-    # the end coefficients are values of the polynomial
-    least = max(least, float(b[0]), float(b[-1]))
-    if b.max() <= least + _SUBDIVISION_ROUNDING * np.abs(b).max():
-        return least
-    left, right = _halves(b, 0.5)
-    return largest(right, 1.0, largest(left, 1.0, least))
-
-
-def _halves(b: Array, s: float) -> tuple[Array, Array]:
-    """Bernstein coefficients of a polynomial on [0, s] and on [s, 1] (de Casteljau)."""
-    left, right, row = np.empty_like(b), np.empty_like(b), b
-    for k in range(b.size):
-        left[k], right[-1 - k] = row[0], row[-1]
-        row = (1.0 - s) * row[:-1] + s * row[1:]
-    return left, right
-
-
 STAGES = 8
 # Lobatto nodes of a step, besides its start, at which the nonlinear remainders are interpolated
 NODES = 7
@@ -116,7 +55,7 @@ NODES = 7
 
 @dataclass(frozen=True, kw_only=True)
 class StepControl:
-    """Constants of events and step control, for the C kernel (as macros) and its NumPy twin.
+    """Constants of events and step control, macros of the C kernel.
 
     Errors are relative to the tolerance.
 
@@ -178,7 +117,7 @@ def polynomials(count: int = STAGES) -> Array:
 
 
 def tables() -> dict[str, Array | float]:
-    """Constants of the method, for the C kernel and its NumPy twin.
+    """Constants of the method, for the C kernel.
 
     POWERS (9, 9) : p_j (rows) by powers of theta.  AT_ONE (9) : p_j(1).
     HULL (9, 16) : w' HULL are the Bernstein coefficients of the sum of w_j p_j, padded with zeros.
@@ -231,230 +170,3 @@ def _node_responses(at: Array, back: Array) -> Array:
                 response = response + at[:, m + k + 1]
             found[k] += np.outer(response, back[m])
     return found
-
-
-# of Newton's method on the remainders: the last change, relative to what they are remainders of. Its error is
-# the square of that (native/implicit_remainders.h).
-_MAX_NEWTON_ITERATIONS, _NEWTON_TOLERANCE = 12, 1e-6
-
-
-class Contact:
-    """Numeric functions of a law and a target, with their derivatives; see `contact_functions`."""
-
-    def __init__(self, law: ContactLaw, target: Target) -> None:
-        self.law_is_nonlinear = not law_is_linear(law)
-        self.target_is_nonlinear = not target_is_linear(target)
-        self._functions = {f.name(): f for f in contact_functions(law, target)}
-        self.target = target
-
-    @property
-    def is_nonlinear(self) -> bool:
-        return self.law_is_nonlinear or self.target_is_nonlinear
-
-    def of(self, law: dict[str, float], target: dict[str, float]) -> Law:
-        """The same with these parameters."""
-        return Law(self, ca.DM(list(law.values())), target)
-
-    def call(self, name: str, *given: Any) -> list[Array]:
-        """Outputs of a function of `contact_functions`."""
-        return [np.array(x, dtype=float) for x in self._functions[name].call([ca.DM(x) for x in given])]
-
-
-class Law:
-    """Law and target with the parameters of one collision."""
-
-    def __init__(self, contact: Contact, law: Any, target: dict[str, float]) -> None:
-        self.contact, self._law, self._parameters = contact, law, target
-        self._target = ca.DM(list(target.values()))
-        self._linear = None if contact.law_is_nonlinear else contact.call("law_slopes", law)[0]
-
-    def force(self, x: float, rate: float, compressing: bool) -> tuple[float, float, float]:
-        """Contact force [N], and its derivatives by penetration [N/m] and by rate of penetration [N s/m]."""
-        if self._linear is None:
-            (found,) = self.contact.call(
-                "law_compressing" if compressing else "law_restoring", x, rate, self._law
-            )
-            f, k, d = (float(value) for value in found.ravel())
-            return f, k, d
-        k, d = (float(value) for value in self._linear[:, int(compressing)])
-        return k * x + d * rate, k, d
-
-    def separation(self, x: float, rate: float) -> float:
-        """Function that is positive while contact lasts in restitution."""
-        if self._linear is None:
-            return float(self.contact.call("separation", x, rate, self._law)[0][0, 0])
-        return self.force(x, rate, False)[0]
-
-    def velocity(self, z: Array) -> float:
-        """Velocity of the target's surface along the normal [m/s]."""
-        return float(self.contact.target.velocity([*z], self._parameters))
-
-    def rates(self, z: Array, force: float) -> Array:
-        """Time derivative of the target's state z (k)."""
-        return np.array([float(x) for x in self.contact.target.derivative([*z], force, self._parameters)])
-
-    def slopes(self, z: Array, force: float) -> tuple[Array, Array, Array]:
-        """Derivatives of the rates by state (k, k) and force (k), and of the velocity by state (k)."""
-        Z, G, velocity_by_z = self.contact.call("target_slopes", z, force, self._target)
-        return Z.reshape(z.size, z.size), G.ravel(), velocity_by_z.ravel()
-
-    def switches(self, z: Array, force: float) -> tuple[Array, Array, Array]:
-        """Switching functions of the target (m), and their derivatives by state (m, k) and force (m)."""
-        values, by_z, by_force = self.contact.call("switch_slopes", z, force, self._target)
-        return values.ravel(), by_z.reshape(values.size, z.size), by_force.ravel()
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class StateMaps:
-    """Matrices and vectors that map a state (m) to the quantities that forces, events and errors depend on.
-
-    They give the parts that are linear in the state; constant terms are left out.
-
-    speeds (n + 1, m) : velocities of the joints, and speed of the hand.  demand (n, m) : servo torques.
-    penetration, impulse (m).  target (k, m) : the target's state.
-    """
-
-    speeds: Array
-    demand: Array
-    penetration: Array
-    impulse: Array
-    target: Array
-
-
-class Step:
-    """Dense output of a step: y(t + theta h) = sum of p_j(theta) times row j of `terms` (9, m).
-
-    rate, force (9) : rate of penetration [m/s] and contact force [N], in the same polynomials.
-    converged : whether Newton's method has converged, with a nonlinear law or target.
-
-    Parameters
-    ----------
-    y, rates : state (m), and its time derivative F(y).
-    slopes : Jacobian of the rates by the state, without law and target (m, m).
-    maps : quantities of the state that law and target depend on.
-    law : of one collision.  now : rate of penetration [m/s], and whether it is compression.  h : [s].
-    """
-
-    def __init__(
-        self,
-        y: Array,
-        rates: Array,
-        slopes: Array,
-        maps: StateMaps,
-        law: Law,
-        now: tuple[float, bool],
-        h: float,
-    ) -> None:
-        self.y, self.h, self.law, self.maps, (self._rate, self._compressing) = y, h, law, maps, now
-        x, z = float(maps.penetration @ y), maps.target @ y
-        self._force, k, d = law.force(x, self._rate, self._compressing)
-        Z, G, velocity_by_z = law.slopes(z, self._force)
-        # gradients (m) of rate of penetration and contact force, and of the target's rates (k, m), by the
-        # state
-        rate = maps.speeds[-1] - velocity_by_z @ maps.target
-        force = k * maps.penetration + d * rate
-        target = Z @ maps.target + np.outer(G, force)
-        self._J = slopes + np.outer(maps.penetration, rate) + np.outer(maps.impulse, force)
-        self._J += maps.target.T @ target
-        # columns of B: remainders of the force, of the target's rates, and of its velocity. The last one
-        # lowers the rate of penetration, and with it the damping force.
-        of_force = maps.impulse + maps.target.T @ G
-        self._B = np.column_stack([of_force, maps.target.T, -maps.penetration - d * of_force])
-        self._k, self._d, self._slopes, self._rates = k, d, (Z, G, velocity_by_z), law.rates(z, self._force)
-        self._S = np.linalg.inv(np.eye(y.size) - gamma() * h * self._J)
-        n = np.zeros((STAGES + 1, 2 + z.size))
-        self.converged = True
-        if law.contact.is_nonlinear:
-            n, self.converged = self._solve_remainders(rates)
-        self.terms = self._series(y, h * rates, n)
-        self.rate, self.force = self.terms @ rate - n[:, -1], self.terms @ force
-        self.force = self.force - d * n[:, -1] + n[:, 0]
-        self.rate[0], self.force[0] = self._rate, self._force
-
-    def _series(self, y: Array, first: Array, n: Array) -> Array:
-        """Terms w_j (9, m) from the state, h times its rates, and the inputs' coefficients (9, inputs)."""
-        g, w = gamma(), np.zeros((STAGES + 1, y.size))
-        w[0], w[1] = y, self._S @ (first + g * self.h * (self._B @ n[1]))
-        for j in range(1, STAGES):
-            w[j + 1] = self.h * (self._S @ (self._J @ w[j] + self._B @ (n[j] + g * n[j + 1])))
-        return w
-
-    def at_nodes(self, terms: Array) -> Array:
-        """Values at the nodes (7, ...) of polynomials given by their terms (9, ...)."""
-        found: Array = node_tables()[0] @ terms
-        return found
-
-    def through_nodes(self, start: Any, function: Callable[[int], Any]) -> Array:
-        """Terms (9, ...) of a polynomial with these values at the start and at node 0 ... 6."""
-        terms: Array = node_tables()[1] @ np.array([np.asarray(function(i)) - start for i in range(NODES)])
-        terms[0] = start
-        return terms
-
-    def _solve_remainders(self, rates: Array) -> tuple[Array, bool]:
-        """Inputs n as terms (9, inputs), by Newton's method on n = R(o(n)); and whether it has converged.
-
-        o are the arguments of law and target at the nodes, (penetration, rate, target's state), which are
-        affine in the inputs: o = base + K n. R are the remainders at these arguments.
-        """
-        inputs, rest, from_nodes = self._B.shape[1], 0.0 * rates, node_tables()[1]
-        base = self._arguments(self._series(self.y, self.h * rates, np.zeros((STAGES + 1, inputs))))
-        arguments = base.shape[1]
-        responses = np.zeros((NODES, arguments, NODES, inputs))
-        for i in range(NODES):
-            for a in range(inputs):
-                unit = np.zeros((STAGES + 1, inputs))
-                unit[:, a] = from_nodes[:, i]
-                responses[:, :, i, a] = self._argument_changes(self._series(rest, rest, unit))
-                if a == inputs - 1:
-                    # the remainder of the target's velocity also acts on the rate directly
-                    responses[i, 1, i, a] -= 1.0
-        K, n = responses.reshape(NODES * arguments, NODES * inputs), np.zeros(NODES * inputs)
-        for _ in range(_MAX_NEWTON_ITERATIONS):
-            at_nodes = base + (K @ n).reshape(NODES, arguments)
-            evaluated = [self._remainders(node) for node in at_nodes]
-            R, sizes = np.array([x[0] for x in evaluated]), np.max([x[2] for x in evaluated], axis=0)
-            # block diagonal: the remainders of a node depend on the arguments there only
-            R_by_o = np.zeros((NODES * inputs, NODES * arguments))
-            for i, (_, slope, _) in enumerate(evaluated):
-                R_by_o[i * inputs : (i + 1) * inputs, i * arguments : (i + 1) * arguments] = slope
-            change = np.linalg.solve(np.eye(n.size) - R_by_o @ K, R.ravel() - n)
-            n = n + change
-            if (np.abs(change).reshape(NODES, inputs) <= _NEWTON_TOLERANCE * sizes).all():
-                return from_nodes @ n.reshape(NODES, inputs), True
-        return from_nodes @ n.reshape(NODES, inputs), False
-
-    def _argument_changes(self, terms: Array) -> Array:
-        """Changes of the arguments at the nodes (7, 2 + k) with a change of the state."""
-        maps, velocity_by_z = self.maps, self._slopes[2]
-        states = self.at_nodes(terms)
-        rate = states @ (maps.speeds[-1] - velocity_by_z @ maps.target)
-        return np.column_stack([states @ maps.penetration, rate, states @ maps.target.T])
-
-    def _arguments(self, terms: Array) -> Array:
-        """Arguments at the nodes (7, 2 + k): penetration, its rate, the target's state."""
-        found = self._argument_changes(terms)
-        maps, velocity_by_z = self.maps, self._slopes[2]
-        # the constant term of the rate, which the maps leave out
-        found[:, 1] += self._rate - self.y @ (maps.speeds[-1] - velocity_by_z @ maps.target)
-        return found
-
-    def _remainders(self, arguments: Array) -> tuple[Array, Array, Array]:
-        """Remainders R (inputs) at one node, their derivatives by the arguments (inputs, 2 + k), and the
-        magnitudes (inputs) of the quantities that they are remainders of.
-        """
-        maps, law, (Z, G, velocity_by_z) = self.maps, self.law, self._slopes
-        x, rate, z = arguments[0], arguments[1], arguments[2:]
-        start = maps.target @ self.y
-        force, k, d = law.force(x, rate, self._compressing)
-        more = force - self._force
-        linear = self._k * (x - float(maps.penetration @ self.y)) + self._d * (rate - self._rate)
-        by = np.zeros((2 + z.size, arguments.size))
-        by[0, :2] = k - self._k, d - self._d
-        if not law.contact.target_is_nonlinear:
-            return np.array([more - linear, *(0.0 * z), 0.0]), by, np.array([abs(force), *(0 * z + 1), 1.0])
-        rates, (Z_1, G_1, velocity_by_z_1) = law.rates(z, force), law.slopes(z, force)
-        by[1:-1, 0], by[1:-1, 1], by[1:-1, 2:] = (G_1 - G) * k, (G_1 - G) * d, Z_1 - Z
-        by[-1, 2:] = velocity_by_z_1 - velocity_by_z
-        R = [more - linear, *(rates - self._rates - Z @ (z - start) - G * more)]
-        R.append(law.velocity(z) - law.velocity(start) - velocity_by_z @ (z - start))
-        return np.array(R), by, np.array([abs(force), *np.abs(rates), abs(rate)])

@@ -28,7 +28,6 @@ Source: S. P. Norsett, "Restricted Pade approximations to the exponential functi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from math import comb
 
@@ -51,50 +50,6 @@ def bernstein_matrix(degree: int) -> Array:
 STAGES = 8
 # Lobatto nodes of a step, besides its start, at which the nonlinear remainders are interpolated
 NODES = 7
-
-
-@dataclass(frozen=True, kw_only=True)
-class StepControl:
-    """Constants of events and step control, macros of the C kernel.
-
-    Errors are relative to the tolerance.
-
-    Attributes
-    ----------
-    event_overshoot : part of its length by which a step passes an event, so that the next one begins in the
-        new phase.
-    immediate_event : part of a step before which an event is immediate: rounding may have hidden that the
-        last one is over.
-    first_step_phase : phase [rad] of the contact's fastest mode in the first step.
-    first_speed_change, first_speed_change_flat : with a nonlinear law instead, the relative change of the
-        hand's speed in it; the second where the force begins without a slope, as x^1.5.
-    lengthen_below, lengthen_below_nonlinear : error below which the next step is longer, for an error of
-        `aimed_error`. That costs a factorization, which nonlinear laws and targets need at each step anyway.
-    retry_factor : of a step for which Newton's method has not converged; at most `max_tries` for a step.
-    separation_fraction : part of the time left to separation that a step takes at most under a nonlinear
-        law. A force like x^1.5 has no Taylor series there: steps get shorter, down to the first one's length.
-    error_of_limit : permitted error of a joint's demand, relative to its torque limit.
-    error_of_switch : permitted error of a target's switch by position, relative to other errors. A position
-        that changes slowly passes its switch too late by it: without the factor, a board bent slowly to its
-        break was off by 1.1e-5.
-    """
-
-    event_overshoot: float = 1e-9
-    immediate_event: float = 1e-5
-    first_step_phase: float = 0.5
-    first_speed_change: float = 0.1
-    first_speed_change_flat: float = 3e-4
-    lengthen_below: float = 2e-3
-    lengthen_below_nonlinear: float = 0.1
-    aimed_error: float = 0.2
-    retry_factor: float = 0.3
-    separation_fraction: float = 0.6
-    error_of_limit: float = 1e-2
-    error_of_switch: float = 0.1
-    max_tries: int = 200
-
-
-CONTROL = StepControl()
 
 
 @cache

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.graph import frozen_dynamics, joint_space_model, rate_of_change
+from impactopt.collision.graph import frozen_dynamics, joint_space_model
 from impactopt.collision.interface import Collision
 from impactopt.collision.model import JointSpaceModel
 from impactopt.collision.stepped import TAKE_FULL, SteppedModel
@@ -259,7 +259,7 @@ class Stability:
     def _slope(self) -> Any:
         """ca.Function (y, *data) -> Jacobian of dy/dt by y."""
         y, data = ca.SX.sym("y", self._model.n_states), self._model.symbols()
-        rate = rate_of_change(self._model, y, self._model.velocity_change(y, data), data)
+        rate = self._model.rate_of_change(y, self._model.velocity_change(y, data), data)
         return ca.Function("slope", [y, *data.values()], [ca.jacobian(rate, y)])
 
     def frozen(self, q: Array, values: dict[str, Array]) -> dict[str, Array]:

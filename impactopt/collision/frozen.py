@@ -374,16 +374,7 @@ class _TreeQuantities:
 def _inverse_of_cholesky(size: int) -> Any:
     """ca.Function G (size, size) symmetric positive definite -> R^-1 with R R' = G, R lower triangular."""
     G = ca.SX.sym("G", size, size)
-    R, inverse = ca.SX.zeros(size, size), ca.SX.zeros(size, size)
-    for j in range(size):
-        R[j, j] = ca.sqrt(G[j, j] - ca.mtimes(R[j, :j], R[j, :j].T))
-        for i in range(j + 1, size):
-            R[i, j] = (G[i, j] - ca.mtimes(R[i, :j], R[j, :j].T)) / R[j, j]
-    for i in range(size):
-        inverse[i, i] = 1 / R[i, i]
-        for j in range(i):
-            inverse[i, j] = -ca.mtimes(R[i, j:i], inverse[j:i, j]) / R[i, i]
-    return ca.Function("inverse_of_cholesky", [G], [inverse])
+    return ca.Function("inverse_of_cholesky", [G], [ca.solve(ca.chol(G).T, ca.SX.eye(size))])
 
 
 def effective_mass(robot: Robot, *, striker: str, normal: ArrayLike, stance: Stance | None = None) -> Any:

@@ -69,7 +69,7 @@ LEFT_OUT_BY_RK4 = 2.0
 def rk4_step(model: JointSpaceModel, length: float) -> Any:
     """ca.Function (y, *data) -> state `length` [s] later; after separation y itself."""
     y, data, u = ca.SX.sym("y", model.n_states), model.small_symbols(), ca.SX.sym("u", model.n)
-    rate = ca.Function("rate", [y, *data.values(), u], [rate_of_change(model, y, u, data)])
+    rate = ca.Function("rate", [y, *data.values(), u], [model.rate_of_change(y, u, data)])
     # A step of length zero leaves the state as it is: so the number of steps can be constant.
     time = model.longest(y, data, length) * model.running(y, data)
     step_length = ca.Function("step_length", [y, *data.values()], [time])
@@ -98,34 +98,6 @@ def rk4_step(model: JointSpaceModel, length: float) -> Any:
             *[more if i == model.layout["left_out"].start else 0.0 for i in range(model.n_states)]
         )
     return ca.Function("step", [Y, *D.values()], [y_next], ["y", *D], ["y_next"])
-
-
-def rate_of_change(model: JointSpaceModel, y: Any, u: Any, data: dict[str, Any]) -> Any:
-    """Time derivative dy/dt in the phase at y; u is the change of the joint velocities at y."""
-    rate = model.rate(y, data)
-    force = model.law.force(model.part(y, "penetration"), rate, model.law_numbers(data))
-    tau = model.saturate(model.with_feedforward(model.servo(y, u, data), data), data)
-    if model.effects.friction:
-        tau = tau - model.friction(u, data)
-    target = model.target.derivative(model.target_state(y), force, model.target_numbers(data))
-    rates = {
-        "time": 1.0,
-        "penetration": rate,
-        "impulse": force,
-        "target": ca.vertcat(*target),
-        # `rk4_step` updates these two, which are no integrals
-        "peak": 0.0,
-        "left_out": 0.0,
-        "torque": tau,
-        "deviation": -u,
-    }
-    if model.slides:
-        velocity, deflection = model.point_velocity(y, data), model.deflection(y)
-        rates["sliding"], rates["bristles"] = model.friction_on_target(velocity, force, deflection, data)
-    if model.second_integrals:
-        once = ("torque", "impulse", *(("sliding",) if model.slides else ()))
-        rates |= {f"{name}2": model.part(y, name) for name in once}
-    return model.join(rates)
 
 
 # largest number of implicit steps, which choose their own length
@@ -222,7 +194,7 @@ def _expressions(
     segmented = SegmentedCollision(
         model,
         frozen,
-        loop=(_implicit if implicit else _explicit)(collision, model, record),
+        loop=(_adaptive if implicit else _explicit)(collision, model, record),
         horizon=collision.horizon,
         freezes=collision.n_freezes,
         names=_frozen_names(collision, model, outputs),
@@ -247,17 +219,16 @@ def _explicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Lo
     return loop
 
 
-def _implicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Loop:
-    """Time loop of implicit steps, which the graph calls in NumPy."""
-    # makes its tables when it is imported, and is needed without a compiler only
-    from impactopt.collision.implicit_numpy import ImplicitLoop
+def _adaptive(collision: SteppedModel, model: JointSpaceModel, every: int) -> Loop:
+    """Time loop without a compiler in the place of implicit steps."""
+    # SciPy's integrators take a while to import, and are needed without a compiler only
+    from impactopt.collision.adaptive import AdaptiveLoop
 
     def loop(start: Any, fraction: float, data: Sequence[Any], record: bool) -> tuple[Any, Any]:
         recorded = record and every > 0
-        function = ImplicitLoop(
+        function = AdaptiveLoop(
             model,
             tolerance=collision.tolerance,
-            most_steps=MOST_STEPS,
             spacing=max(every, 1) * collision.step_length,
             columns=columns_of(collision, fraction, every) if recorded else 1,
         )

@@ -251,10 +251,10 @@ class JointSpaceModel:
         force = self.law.branch(self.part(y, "penetration"), rate, False, self.law_numbers(data))
         # at equal speeds, the accelerations at the start of a freeze decide
         at_rest = ca.logic_and(rate == 0, self.part(y, "time") == 0)
-        compressing = ca.logic_or(rate > 0, ca.logic_and(at_rest, self._closing(y, data) > 0))
+        compressing = ca.logic_or(rate > 0, ca.logic_and(at_rest, self.closing(y, data) > 0))
         return compressing, ca.logic_or(compressing, force > 0)
 
-    def _closing(self, y: Any, data: dict[str, Any]) -> Any:
+    def closing(self, y: Any, data: dict[str, Any]) -> Any:
         """Acceleration [m/s2] of hand towards target, at the start of a freeze and at equal speeds.
 
         It decides between compression and restitution if the rate of penetration is zero.
@@ -310,6 +310,37 @@ class JointSpaceModel:
         rate = _spread(data["joint_velocity"], u) + u
         sign = ca.fmax(ca.fmin(rate / self.transition, 1.0), -1.0)
         return _spread(data["viscous"], u) * rate + _spread(data["coulomb"], u) * sign
+
+    def rate_of_change(self, y: Any, u: Any, data: dict[str, Any], force: Any = None) -> Any:
+        """Time derivative dy/dt at y; u is the change of the joint velocities at y.
+
+        force [N] : of the contact; None: the law's in the phase at y.
+        """
+        rate = self.rate(y, data)
+        if force is None:
+            force = self.law.force(self.part(y, "penetration"), rate, self.law_numbers(data))
+        tau = self.saturate(self.with_feedforward(self.servo(y, u, data), data), data)
+        if self.effects.friction:
+            tau = tau - self.friction(u, data)
+        target = self.target.derivative(self.target_state(y), force, self.target_numbers(data))
+        rates = {
+            "time": 1.0,
+            "penetration": rate,
+            "impulse": force,
+            "target": ca.vertcat(*target),
+            # no integrals: the steps update these two
+            "peak": 0.0,
+            "left_out": 0.0,
+            "torque": tau,
+            "deviation": -u,
+        }
+        if self.slides:
+            velocity, deflection = self.point_velocity(y, data), self.deflection(y)
+            rates["sliding"], rates["bristles"] = self.friction_on_target(velocity, force, deflection, data)
+        if self.second_integrals:
+            once = ("torque", "impulse", *(("sliding",) if self.slides else ()))
+            rates |= {f"{name}2": self.part(y, name) for name in once}
+        return self.join(rates)
 
 
 def shape_of(value: NDArray[np.float64]) -> tuple[int, int]:

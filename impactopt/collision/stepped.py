@@ -156,10 +156,10 @@ class SteppedModel(CollisionModel):
     ----------
     effects : effects that are taken into account.
     method : integration method of the frozen system. "implicit" (None): L-stable steps of order eight that
-        end on events and choose their own length. Without a C compiler they are done in NumPy, with the same
-        results, a hundred times slower, and without derivatives. "rk4": the paper's fixed Runge-Kutta steps,
-        exact to 1e-2 of the impulse (of a plastic impact's, if contact ends early). `collide` refuses steps
-        whose estimated error is larger.
+        end on events and choose their own length. Without a C compiler SciPy's LSODA takes their place: the
+        same results within the tolerance, some hundred times slower, without derivatives. "rk4": the paper's
+        fixed Runge-Kutta steps, exact to 1e-2 of the impulse (of a plastic impact's, if contact ends early).
+        `collide` refuses steps whose estimated error is larger.
     step : [s]. With "rk4" the length of its steps, below `stable_step(q)`; None: the paper's 1e-4. With
         "implicit", which chooses its own steps, the spacing of histories; None: 1e-3. Of shorter contacts
         histories have the ends alone, where there is no force: give a tenth of the contact's duration.

@@ -236,19 +236,8 @@ def with_tool(model: pin.Model, tool: Tool) -> pin.Model:
 
 
 def without(whole: Any, part: Any) -> Any:
-    """pin.Inertia of a body without a part of it, both in the same frame."""
-    mass = whole.mass - part.mass
-    if mass <= 1e-6:
-        return pin.Inertia.Zero()
-    lever = (whole.mass * whole.lever - part.mass * part.lever) / mass
-
-    def about_origin(body: Any) -> Array:
-        c = np.array(body.lever)
-        return np.array(body.inertia) + body.mass * (c @ c * np.eye(3) - np.outer(c, c))
-
-    inertia = about_origin(whole) - about_origin(part)
-    inertia -= mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
-    return pin.Inertia(mass, lever, inertia)
+    """pin.Inertia of a body without a part of it, both in the same frame; zero if nothing is left."""
+    return whole - part if whole.mass - part.mass > 1e-6 else pin.Inertia.Zero()
 
 
 def without_tool(model: pin.Model, tool: Tool) -> pin.Model:

@@ -8,7 +8,7 @@ parameters. This module finds the chains, and adds blocks and constraints to a p
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -289,55 +289,42 @@ def add_clearance_constraints(
         [part for (_, slots), moved in zip(spots, displacements, strict=True) for part in (*slots, moved)]
     )
     coordinates, constants, radius = everywhere.matrix(b.layout.n), everywhere.const, shapes.radius.tolist()
-    known: dict[tuple[int, int], _BodyPair] = {}
-    groups: dict[int, _Group] = {}  # by number of joints: a block has one
+    known: dict[tuple[int, int], tuple[Chain, tuple[Index, Index, Array], str]] = {}
+    groups: dict[int, list[tuple[Any, ...]]] = {}  # constraints by number of joints: a block has one
     for key, direction in constraints.items():
         body = bodies.world[-1 - key.other] if key.other < 0 else None
         pair = key.joint, key.other
         if pair not in known:
             chain = _chain(b.robot, key.joint, max(key.other, 0))
-            pattern = chain.pattern(b.coordinates, body)
-            known[pair] = _BodyPair(chain, pattern, " and ".join(bodies.names(pair)))
+            known[pair] = chain, chain.pattern(b.coordinates, body), " and ".join(bodies.names(pair))
         chain, pattern, name = known[pair]
-        before = None
-        if body is not None:
-            before = _placed(body).inverse()  # distances are in the body's frame
-        n = shapes.index[key.joint, key.other, key.number]
-        group = groups.setdefault(len(chain.columns), _Group())
-        group.keys.append(key)
-        group.pairs.append(n)
-        group.directions.append(direction.vector)
-        group.patterns.append(pattern)
-        group.spots.append(spot_of[key.place])
+        # distances are in the body's frame
+        parameters = chain.parameters(None if body is None else _placed(body).inverse())
+        n, spot = shapes.index[key.joint, key.other, key.number], spot_of[key.place]
         # capsules and spheres are their axes and centres, at a distance that is larger by their radius
-        group.parameters.append(chain.parameters(before))
-        group.distances.append(direction.least_distance + radius[n])
+        distance = direction.least_distance + radius[n]
         term = (SelfCollision if key.other >= 0 else KeepOut).name
         # each pair of pieces of two bodies has a name of its own, by which multipliers are mapped
         piece = f"{name} {key.number + 1}" if key.number else name
-        group.origins.append(
-            ConstraintOrigin(term, spots[spot_of[key.place]][0], piece, TOO_NEAR, whole=name)
-        )
+        origin = ConstraintOrigin(term, spots[spot][0], piece, TOO_NEAR, whole=name)
+        group = groups.setdefault(len(chain.columns), [])
+        group.append((key, n, direction.vector, origin, pattern, spot, parameters, distance))
     # z is a selection of the coordinates at all nodes, which are affine in the variables
     for length, group in groups.items():
-        size, count = length + 3, len(group.pairs)
-        counts = [len(slots) for slots, _, _ in group.patterns]
-        slots, columns, factors = (np.concatenate([p[k] for p in group.patterns]) for k in range(3))
+        _, pairs, vectors, origins, patterns, nodes, numbers, distances = zip(*group, strict=True)
+        size, count = length + 3, len(pairs)
+        counts = [len(slots) for slots, _, _ in patterns]
+        slots, columns, factors = (np.concatenate([p[k] for p in patterns]) for k in range(3))
         instance = np.repeat(np.arange(count), counts)
         # rows of `coordinates`: (y, legs, displacement) of one node after the other, `width` each
-        at = np.repeat(group.spots, counts) * width + columns
+        at = np.repeat(nodes, counts) * width + columns
         chosen = sp.csr_array((factors, (instance * size + slots, at)), shape=(count * size, len(constants)))
-        of = Separations(
-            shapes,
-            length,
-            np.array(group.pairs),
-            np.column_stack([np.array(group.parameters), group.distances]),
-            np.array(group.directions, dtype=float),
-        )
+        chains = np.column_stack([np.array(numbers), distances])
+        of = Separations(shapes, length, np.array(pairs), chains, np.array(vectors, dtype=float))
         lift = Affine.of_matrix(chosen @ coordinates, chosen @ constants)
         first = b.append(SeparationBlock.of_separations(f"apart{length}", of, lift))
-        b.constraints.add_each(group.origins, outputs=first + np.arange(count), lower=0.0)
-    return [key for group in groups.values() for key in group.keys]
+        b.constraints.add_each(origins, outputs=first + np.arange(count), lower=0.0)
+    return [constraint[0] for group in groups.values() for constraint in group]
 
 
 def coupled(
@@ -381,28 +368,3 @@ def move_bodies(
         instance[name] += 1
     for name, block in of_name.items():
         block.take_parameters(parameters[name])
-
-
-class _BodyPair(NamedTuple):
-    """Data that all constraints of a pair of bodies share."""
-
-    chain: Chain
-    pattern: tuple[Index, Index, Array]
-    name: str
-
-
-@dataclass(frozen=True)
-class _Group:
-    """Constraints whose chains have the same number of joints, with lists of one entry a constraint.
-
-    pairs : index in `Shapes`.  patterns : `Chain.pattern`.  spots : index of the node.
-    """
-
-    keys: list[ClearanceKey] = field(default_factory=list)
-    pairs: list[int] = field(default_factory=list)
-    directions: list[tuple[float, ...]] = field(default_factory=list)
-    origins: list[ConstraintOrigin] = field(default_factory=list)
-    patterns: list[tuple[Index, Index, Array]] = field(default_factory=list)
-    spots: list[int] = field(default_factory=list)
-    parameters: list[Array] = field(default_factory=list)
-    distances: list[float] = field(default_factory=list)

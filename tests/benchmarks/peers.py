@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.setup import Setup
 from impactopt.collision import Collision
-from impactopt.collision.graph import frozen_dynamics, joint_space_model, rate_of_change, target_start
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_start
 from impactopt.simulation.mujoco_world import mujoco_module, no_log_file
 from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
@@ -134,7 +134,7 @@ def cvodes(setup: Setup, duration: float, tolerance: float) -> tuple[Callable[[]
     sdc, case = setup.model(), setup.case
     model = joint_space_model(sdc)
     y, data = ca.SX.sym("y", model.n_states), model.symbols()
-    rate = rate_of_change(model, y, model.velocity_change(y, data), data)
+    rate = model.rate_of_change(y, model.velocity_change(y, data), data)
     problem = {"x": y, "p": ca.vertcat(*map(ca.vec, data.values())), "ode": rate}
     options = {"reltol": tolerance, "abstol": 1e-2 * tolerance, "max_num_steps": 100_000}
     solver = ca.integrator("collision", "cvodes", problem, 0.0, duration, options)

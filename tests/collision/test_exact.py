@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from support.exact import ExactCollision
+from support.exact.bernstein import first_negative, largest
 from support.exact_reference import Case, random_case, robot_named
 from support.small_robots import slider
 
@@ -24,7 +25,7 @@ from impactopt import (
     SpringDamper,
     VirtualMass,
 )
-from impactopt.collision.implicit import bernstein_matrix, first_negative, largest
+from impactopt.collision.implicit import bernstein_matrix
 
 X = np.array([1.0, 0.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=2.0)

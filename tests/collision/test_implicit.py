@@ -243,7 +243,7 @@ def test_several_freezes_take_implicit_steps_too() -> None:
     assert model.stepping == "implicit"
     q, v, torque, given = cases_of(model, 1)[0]
     found = model.collide(q, v, torque, **given)
-    # the steps in NumPy, in the graph's own course
+    # the steps without a compiler, in the graph's own course
     outputs = ("impulse", "peak_force", "configuration")
     values = model.settings.override(given).values()
     graph = collision_graph(model, outputs, as_compiled=True)

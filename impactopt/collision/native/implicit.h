@@ -1,5 +1,4 @@
-/* Implicit steps that end on events; see collision/implicit.py for the method, its symbols and the
-   constants of its step control.
+/* Implicit steps that end on events; see collision/implicit.py for the method and its symbols.
 
    The joints' velocity and the hand's speed are v = Q (T, -p) + drift t. With g = gamma h and D = kd + g kp of the
    joints that are not saturated (plus the slope of their friction), a stage solves v = X (rho, -p), where
@@ -9,6 +8,33 @@
    implicit_remainders.h. */
 
 #define TERMS (STAGES + 1)
+
+/* Constants of events and step control. Errors are relative to the tolerance. */
+/* Part of its length by which a step passes an event, so that the next one begins in the new phase. */
+#define EVENT_OVERSHOOT 1e-9
+/* Part of a step before which an event is immediate: rounding may have hidden that the last one is over. */
+#define IMMEDIATE_EVENT 1e-5
+/* Phase [rad] of the contact's fastest mode in the first step. With a nonlinear law instead, the relative change of the
+   hand's speed in it; the second where the force begins without a slope, as x^1.5. */
+#define FIRST_STEP_PHASE 0.5
+#define FIRST_SPEED_CHANGE 0.1
+#define FIRST_SPEED_CHANGE_FLAT 3e-4
+/* Error below which the next step is longer, for an error of AIMED_ERROR. That costs a factorization, which nonlinear
+   laws and targets need at each step anyway. */
+#define LENGTHEN_BELOW 2e-3
+#define LENGTHEN_BELOW_NONLINEAR 0.1
+#define AIMED_ERROR 0.2
+/* Of a step for which Newton's method has not converged; at most MAX_TRIES for a step. */
+#define RETRY_FACTOR 0.3
+#define MAX_TRIES 200
+/* Part of the time left to separation that a step takes at most under a nonlinear law. A force like x^1.5 has no Taylor
+   series there: steps get shorter, down to the first one's length. */
+#define SEPARATION_FRACTION 0.6
+/* Permitted error of a joint's demand, relative to its torque limit. */
+#define ERROR_OF_LIMIT 1e-2
+/* Permitted error of a target's switch by position, relative to other errors. A position that changes slowly passes its
+   switch too late by it: without the factor, a board bent slowly to its break was off by 1.1e-5. */
+#define ERROR_OF_SWITCH 0.1
 
 /* Law and target linearized where the step begins, and the inverse of I - g dz'/dz. */
 typedef struct {

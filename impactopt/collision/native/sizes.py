@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -27,7 +27,7 @@ from impactopt.collision.graph import (
     joint_space_model,
     target_start,
 )
-from impactopt.collision.implicit import CONTROL, NODES, STAGES, gamma, tables
+from impactopt.collision.implicit import NODES, STAGES, gamma, tables
 from impactopt.collision.model import GIVES_WAY, JointSpaceModel, cuts, shape_of
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
 from impactopt.collision.stepped import (
@@ -477,8 +477,7 @@ def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: T
         shapes_table("SHAPES_IN", shapes.values()),
     ]
     if collision.stepping == "implicit":
-        control = {name.upper(): value for name, value in asdict(CONTROL).items()}
-        text += [_matrix(name, x) for name, x in {**tables(), **control}.items()]
+        text += [_matrix(name, x) for name, x in tables().items()]
     return "\n".join(text) + "\n"
 
 

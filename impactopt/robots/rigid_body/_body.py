@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError
 from impactopt.robots.rigid_body import _dynamics
-from impactopt.robots.rigid_body._dynamics import Accelerations, Factor, Kinematics, Velocities, tree_entries
+from impactopt.robots.rigid_body._dynamics import Accelerations, Factor, Kinematics, Velocities
 from impactopt.robots.rigid_body._spatial import (
     Scalar,
     Vector,
@@ -116,18 +116,12 @@ class RigidBody:
 
         Parameters
         ----------
-        H : SX (nv, nv) symmetric with the pattern of `mass_matrix()`, of which the upper triangle is read;
-            None: the mass matrix.
+        H : SX (nv, nv) symmetric, mostly with the pattern of `mass_matrix()`; None: the mass matrix.
         """
-        parents = self._tree.velocity_parents()
-        if H is None:
-            upper = dict(self._crba().entries)
-        else:
-            H = as_sx("H", H)
-            if H.shape != (self.nv, self.nv):
-                raise InputError(f"H: expected shape {(self.nv, self.nv)}, got {H.shape}")
-            upper = tree_entries(parents, H)
-        return Factor(parents, upper)
+        H = self.mass_matrix() if H is None else as_sx("H", H)
+        if H.shape != (self.nv, self.nv):
+            raise InputError(f"H: expected shape {(self.nv, self.nv)}, got {H.shape}")
+        return Factor(H)
 
     # ------------------------------------------------------------ momentum
     def com(self) -> Any:

@@ -7,8 +7,9 @@ derivatives have no entries for it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
+
+import casadi as ca
 
 from impactopt.errors import InputError
 from impactopt.robots.rigid_body._spatial import (
@@ -22,7 +23,6 @@ from impactopt.robots.rigid_body._spatial import (
     cross,
     is_zero,
     move_tensor,
-    pack_entries,
     product,
     rotate_back_z,
     rotate_z,
@@ -33,7 +33,6 @@ from impactopt.robots.rigid_body._spatial import (
     tensor_rotate_z,
     times,
     transpose_times,
-    unpack_entries,
     zero_vector,
 )
 from impactopt.robots.rigid_body._tree import Coordinates, Kind, Tree
@@ -249,106 +248,44 @@ class Accelerations:
 
 
 class Factor:
-    """Factorization H = L' D L of a symmetric positive definite matrix with a tree's sparsity pattern.
+    """Factorization H = L' D L of a symmetric positive definite matrix, SX (nv, nv).
 
     L is unit lower triangular, D diagonal. Eliminating from the leaves to the root makes no fill-in
     (Featherstone 2008, section 6.5). Structural zeros of a right-hand side are kept, so that the cost of a
     solve is that of the branches with nonzeros.
     """
 
-    def __init__(self, parents: list[int], upper: Mapping[tuple[int, int], Number]) -> None:
-        self._parents, self.nv = parents, len(parents)
-        A: dict[tuple[int, int], Number] = {}  # (k, j) with j <= k: the lower triangle, overwritten
+    def __init__(self, H: Any) -> None:
+        self.nv = H.size1()
         for k in range(self.nv):
-            for j in (k, *self._ancestors(k)):
-                A[k, j] = upper.get((j, k), 0.0)
-        self._L: dict[tuple[int, int], Number] = {}
-        self._D: list[Number] = [0.0] * self.nv
-        for k in range(self.nv - 1, -1, -1):
-            if is_zero(A[k, k]):
+            if H[k, k].is_zero():
                 raise InputError(
                     f"H: velocity {k} has no inertia (its row is zero); give the link inertia or armature"
                 )
-            self._D[k] = A[k, k]
-            above = [i for i in self._ancestors(k) if not is_zero(A[k, i])]
-            for i in above:
-                self._L[k, i] = A[k, i] / A[k, k]
-            for i in above:
-                for j in (i, *self._ancestors(i)):
-                    A[i, j] = A[i, j] - self._L[k, i] * A[k, j]
-
-    def _ancestors(self, k: int) -> list[int]:
-        chain = []
-        k = self._parents[k]
-        while k >= 0:
-            chain.append(k)
-            k = self._parents[k]
-        return chain
+        # CasADi eliminates from the first row on, and has L as a strictly triangular matrix
+        self._leaves_first = slice(None, None, -1)
+        self._D, strict, _ = ca.ldl(H[self._leaves_first, self._leaves_first], False)
+        self._L = strict.T + ca.SX.eye(self.nv)
 
     def half_solve(self, b: Any) -> Any:
         """L^-T b, SX (nv, k): with y = half_solve(b), b' H^-1 b = y' D^-1 y."""
-        return self._pack([self._half(x) for x in self._columns(b, "b")])
+        return self._half(b)[self._leaves_first, :]
 
     def solve(self, b: Any) -> Any:
         """H^-1 b, SX (nv, k)."""
-        return self._pack([self._back(self._half(x)) for x in self._columns(b, "b")])
+        y = self._half(b)
+        return ca.solve(self._L.T, y / ca.repmat(self._D, 1, y.size2()))[self._leaves_first, :]
 
     @property
     def diagonal(self) -> Any:
         """D, SX (nv)."""
-        return self._pack([dict(enumerate(self._D))])
+        return self._D[self._leaves_first]
 
-    # ------------------------------------------------------------ sparse columns {row: number}
-    def _columns(self, b: Any, name: str) -> list[dict[int, Number]]:
-        b = as_sx(name, b)
+    def _half(self, b: Any) -> Any:
+        b = as_sx("b", b)
         if b.size1() != self.nv:
-            raise InputError(f"{name}: expected {self.nv} rows, got shape {b.shape}")
-        columns: list[dict[int, Number]] = [{} for _ in range(b.size2())]
-        for (r, c), number in unpack_entries(b).items():
-            if not is_zero(number):
-                columns[c][r] = number
-        return columns
-
-    def _pack(self, columns: list[dict[int, Number]]) -> Any:
-        entries = {(r, c): x for c, column in enumerate(columns) for r, x in column.items()}
-        return pack_entries((self.nv, len(columns)), entries)
-
-    def _half(self, b: dict[int, Number]) -> dict[int, Number]:
-        """L^-T b by substitution from the leaves to the root; nonzeros spread to ancestors only."""
-        y = dict(b)
-        for k in range(self.nv - 1, -1, -1):
-            if k in y:
-                for i in self._ancestors(k):
-                    if (k, i) in self._L:
-                        y[i] = y.get(i, 0.0) - self._L[k, i] * y[k]
-        return y
-
-    def _back(self, y: dict[int, Number]) -> dict[int, Number]:
-        """L^-1 D^-1 y by substitution from the root to the leaves."""
-        x: dict[int, Number] = {}
-        for k in range(self.nv):
-            value: Number = y[k] / self._D[k] if k in y else 0.0
-            for i in self._ancestors(k):
-                if i in x and (k, i) in self._L:
-                    value = value - self._L[k, i] * x[i]
-            if not is_zero(value):
-                x[k] = value
-        return x
-
-
-def tree_entries(parents: list[int], H: Any) -> dict[tuple[int, int], Number]:
-    """The upper triangle of H, SX (nv, nv), checked to have the tree's pattern."""
-    upper = {place: x for place, x in unpack_entries(H).items() if place[0] <= place[1] and not is_zero(x)}
-    for i, j in upper:
-        # i has to be an ancestor of j
-        k = j
-        while k > i:
-            k = parents[k]
-        if k != i:
-            raise InputError(
-                f"H: entry ({i}, {j}) couples two branches of the tree; factorize such a matrix densely"
-            )
-    return upper
+            raise InputError(f"b: expected {self.nv} rows, got shape {b.shape}")
+        return ca.solve(self._L, ca.sparsify(b)[self._leaves_first, :])
 
 
 class CompositeInertias:

@@ -90,11 +90,6 @@ class Joint:
         """Velocity or acceleration of this joint, from those of the tree (nv)."""
         return self.ratio * values[self.v]
 
-    @property
-    def velocities(self) -> range:
-        """Indices of its velocities."""
-        return range(self.v, self.v + (6 if self.kind is Kind.FREE else 1))
-
 
 class Tree:
     """Joints of a `pin.Model` (index 0 is the universe), parents before children.
@@ -148,27 +143,6 @@ class Tree:
             chain.append(i)
             i = self.joints[i].parent
         return chain[::-1]
-
-    def velocity_parents(self) -> list[int]:
-        """Parent of each velocity index in the elimination tree of H, -1 at a root.
-
-        Without followers that is the tree of single degrees of freedom, the six of a free-flyer being a chain
-        (Featherstone 2008, expanded parent array). A follower couples its own branch with its leader's.
-        """
-        before: list[set[int]] = [set() for _ in range(self.nv)]  # columns of the nonzeros of row k, up to k
-        for i in range(1, len(self)):
-            own = self.joints[i].velocities
-            for j in self.support(i):
-                for k in own:
-                    for other in self.joints[j].velocities:
-                        before[max(k, other)].add(min(k, other))
-        parents = [-1] * self.nv
-        for k in range(self.nv - 1, -1, -1):
-            if coupled := before[k] - {k}:
-                # eliminating k makes all that it is coupled with dense: the fill-in goes to its parent
-                parents[k] = max(coupled)
-                before[parents[k]] |= coupled
-        return parents
 
     def frame(self, name: str) -> tuple[int, Matrix, Vector]:
         """(joint, rotation, translation [m]) of a frame in its link's turned frame.

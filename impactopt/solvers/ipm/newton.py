@@ -6,7 +6,6 @@ import hashlib
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,19 +15,12 @@ from impactopt.solvers.elimination.kernels import Index, Kernels, Panels, Places
 from impactopt.solvers.elimination.kernels import kernels as fastest_kernels
 from impactopt.solvers.program import Determined, Matrix, Vector
 
-# Merging is for the kernels in NumPy: a factorization for punch takes 3.4 ms with it, 4.6 ms without, but
-# those in C take 0.5 ms with and without.
-_MAX_MERGED_WIDTH = 24  # variables of a merged block
-_MAX_ZEROS = 0.1  # fraction of zeros that a merged block's panel may have
-
 
 def elimination_blocks(pattern: Any) -> list[Index]:
     """Elimination order in blocks of variables (supernodes), the first to be eliminated in front.
 
-    Variables with the same neighbours form a group. Groups are ordered by minimum degree: the one with the
-    fewest neighbours first (Davis, Direct Methods for Sparse Linear Systems, 2006, section 7.1). Then groups
-    with nearly the same neighbours are merged to a block, as a few large products take less time than many
-    small ones.
+    Variables with the same neighbours form a block. Blocks are ordered by minimum degree: the one with the
+    fewest neighbours first (Davis, Direct Methods for Sparse Linear Systems, 2006, section 7.1).
 
     pattern (n, n) : which entries may be nonzero, symmetric.
     """
@@ -42,104 +34,23 @@ def elimination_blocks(pattern: Any) -> list[Index]:
     groups = [np.array(same) for same in members.values()]
     first, sizes = (np.array([of(g) for g in groups], dtype=np.intp) for of in (np.min, np.size))
     # One member stands for its group, and the group's size counts in degrees.
-    order, below = _minimum_degree(neighbours[np.ix_(first, first)], sizes)
-    roots = _merged_blocks(order, below, sizes)
-    return [np.concatenate([groups[g] for g in b.groups]) for root in roots for b in root.in_order()]
+    return [groups[k] for k in _minimum_degree(neighbours[np.ix_(first, first)], sizes)]
 
 
-def _minimum_degree(neighbours: Any, sizes: Index) -> tuple[Index, Any]:
-    """Order of the groups (g,), and the later neighbours of each when it is eliminated (g, g)."""
-    neighbours, left = neighbours.copy(), np.ones(sizes.size, dtype=bool)
-    order, below = np.zeros_like(sizes), np.zeros_like(neighbours)
+def _minimum_degree(neighbours: Any, sizes: Index) -> list[int]:
+    """Order of the groups (g,), of these sizes."""
+    neighbours, left, order = neighbours.copy(), np.ones(sizes.size, dtype=bool), []
     # In variables, those of the group itself included.
     degree = neighbours @ sizes
-    for i in range(sizes.size):
-        k = order[i] = int(np.argmin(np.where(left, degree, np.inf)))
+    for _ in range(sizes.size):
+        order.append(k := int(np.argmin(np.where(left, degree, np.inf))))
         left[k] = False
-        below[k] = neighbours[k] & left
         # elimination makes all neighbours of k neighbours of each other
-        rows = np.flatnonzero(below[k])
+        rows = np.flatnonzero(neighbours[k] & left)
         neighbours[np.ix_(rows, rows)] = True
         # Only the neighbours of k have new degrees.
         degree[rows] = (neighbours[rows] & left) @ sizes
-    return order, below
-
-
-@dataclass
-class _Block:
-    """Groups that are eliminated one after the other: a node of the elimination tree.
-
-    below : groups in the rows under the diagonal block.  width, height : variables of both.  entries :
-    nonzero ones of the panel.  children : blocks to be eliminated before.
-    """
-
-    groups: list[int]
-    below: Any
-    width: int
-    height: int
-    entries: float
-    children: list[_Block] = field(default_factory=list)
-
-    def in_order(self) -> list[_Block]:
-        """This block after all its descendants; not recursive, as the tree of a long motion is very deep."""
-        out, waiting = list[_Block](), [self]
-        while waiting:  # parents before their children, and the last child first
-            out.append(block := waiting.pop())
-            waiting += block.children
-        return out[::-1]
-
-    def merged(self, later: _Block, sizes: Index) -> _Block | None:
-        """This block and a later one as one; None if that is too wide or has too many zeros."""
-        width = self.width + later.width
-        below = self.below | later.below
-        below[later.groups] = False
-        height = int(below @ sizes)
-        entries = self.entries + later.entries
-        if width > _MAX_MERGED_WIDTH or entries < (1.0 - _MAX_ZEROS) * _panel_entries(width, height):
-            return None
-        groups, children = self.groups + later.groups, self.children + later.children
-        return _Block(groups, below, width, height, entries, children)
-
-
-def _panel_entries(width: int, height: int) -> float:
-    """Number of entries of a panel, with the lower triangle of its diagonal block."""
-    return width * (height + 0.5 * (width + 1))
-
-
-def _merged_blocks(order: Index, below: Any, sizes: Index) -> list[_Block]:
-    """Roots of the elimination tree, after blocks have been merged with their parents and siblings."""
-    place = np.empty_like(order)
-    place[order] = np.arange(order.size)
-    waiting: dict[int, list[_Block]] = {}  # by their parent: the first group below the diagonal
-    for k in map(int, order):
-        width, height = int(sizes[k]), int(below[k] @ sizes)
-        block = _Block([k], below[k], width, height, _panel_entries(width, height))
-        for child in _merged_siblings(waiting.pop(k, []), sizes):
-            merged = child.merged(block, sizes)
-            if merged is None:
-                block.children.append(child)
-            else:
-                block = merged
-        # The first group below the diagonal is the parent in the elimination tree (Davis, section 4.1): it is
-        # the first that waits for this block.
-        later = np.flatnonzero(block.below)
-        parent = int(later[np.argmin(place[later])]) if later.size else -1
-        waiting.setdefault(parent, []).append(block)
-    return waiting.get(-1, [])
-
-
-def _merged_siblings(blocks: list[_Block], sizes: Index) -> list[_Block]:
-    """Children of one block; those with nearly the same rows below are merged."""
-    out: list[_Block] = []
-    for block in blocks:
-        for i, other in enumerate(out):
-            merged = other.merged(block, sizes)
-            if merged is not None:
-                out[i] = merged
-                break
-        else:
-            out.append(block)
-    return out
+    return order
 
 
 class BlockCholesky:

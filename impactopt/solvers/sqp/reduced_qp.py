@@ -15,7 +15,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -215,22 +215,6 @@ class ReducedModel:
         return np.asarray(out if self.TH is None else out + self.TH @ d0)
 
 
-class ModelRule(Protocol):
-    """Rule that makes the model at a point."""
-
-    def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
-        """Model of the Lagrangian with multipliers y (m,).
-
-        active : gives the gradients (a, r), along T and of norm 1, of the active constraints.
-        objective : False for a model of the violation alone.
-        """
-        ...
-
-    def forget(self) -> None:
-        """Discard the information of earlier points."""
-        ...
-
-
 class ExactModel:
     """Exact reduced Hessian, made convex by a weight of active constraints or lifted eigenvalues."""
 
@@ -238,6 +222,11 @@ class ExactModel:
         self._program, self._reduction = program, reduction
 
     def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
+        """Model, at a point, of the Lagrangian with multipliers y (m,).
+
+        active : gives the gradients (a, r), along T and of norm 1, of the active constraints.
+        objective : False for a model of the violation alone.
+        """
         T = self._reduction.T
         if not objective:
             return _restoration_model(point, T)
@@ -246,7 +235,7 @@ class ExactModel:
         return ReducedModel(_convex(0.5 * (B + B.T), active()), point.gradient, T, TH)
 
     def forget(self) -> None:
-        pass
+        """Discard the information of earlier points: nothing here."""
 
 
 class BFGSModel:
@@ -325,7 +314,7 @@ def _restoration_model(point: Point, T: np.ndarray) -> ReducedModel:
     return ReducedModel(B, np.zeros_like(point.gradient), T, None, has_objective=False)
 
 
-def make_model(program: TimedProgram, options: SQPOptions, reduction: Reduction) -> ModelRule:
+def make_model(program: TimedProgram, options: SQPOptions, reduction: Reduction) -> ExactModel | BFGSModel:
     """The rule that the options name."""
     return ExactModel(program, reduction) if options.hessian == "exact" else BFGSModel(reduction)
 

@@ -213,10 +213,15 @@ def test_factor_has_no_fill_in() -> None:
     assert not pattern.all()
 
 
-def test_factor_refuses_what_does_not_fit_the_tree() -> None:
+def test_a_matrix_that_couples_branches_of_the_tree_is_factorized_too() -> None:
+    rb = symbols("tree fixed 3").rb
+    H = np.ones((rb.nv, rb.nv)) + np.diag(np.arange(1.0, rb.nv + 1))
+    inverse = ca.DM(rb.factorize(H).solve(ca.SX.eye(rb.nv)))
+    np.testing.assert_allclose(inverse, np.linalg.inv(H), atol=1e-12)
+
+
+def test_factor_refuses_other_shapes() -> None:
     rb = symbols("g1").rb
-    with pytest.raises(InputError, match="couples two branches"):
-        rb.factorize(ca.SX.ones(rb.nv, rb.nv))
     with pytest.raises(InputError, match=r"H: expected shape \(35, 35\)"):
         rb.factorize(ca.SX.eye(3))
     with pytest.raises(InputError, match="b: expected 35 rows"):

@@ -20,12 +20,13 @@ from scipy.linalg import expm
 
 from impactopt import InputError
 from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_start
-from impactopt.collision.implicit import bernstein_matrix, first_negative, largest
+from impactopt.collision.implicit import bernstein_matrix
 from impactopt.collision.interface import Collision
 from impactopt.collision.model import Segment, relative_to
 from impactopt.collision.outputs import Outputs, frozen_for
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import check_array
+from support.exact.bernstein import first_negative, largest
 from support.exact.linear_contact import force_coefficients, target_modes
 from support.exact.modes import Modes, Phase
 

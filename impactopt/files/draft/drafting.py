@@ -128,8 +128,8 @@ def draft_problem(
 class _Case:
     """A robot to draft for, and what is found on it.
 
-    arms : the one that strikes first.  forward (3,) : in the root's frame.  folder : of the file.  say : reports
-    progress.
+    arms : the one that strikes first.  forward (3,) : in the root's frame.  folder : of the file.
+    say : reports progress.
     """
 
     drafted: Drafted

@@ -20,7 +20,7 @@ from impactopt.kinematics.operational_space import holding_torque, striking_velo
 from impactopt.kinematics.stance import support_polygon
 from impactopt.live.drawing import Drawing, Moment
 from impactopt.live.requests import LatestRequest
-from impactopt.live.server import LOCAL, LivePage, served
+from impactopt.live.server import LivePage, served
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import drawn_ranges
 from impactopt.report.tracks import places_of
@@ -51,7 +51,7 @@ class CollisionPage(LivePage):
 
     problem : its robot, stance, contact law and target; the first posture reaches its point. The soles stay
         in place, as the legs follow by inverse kinematics. The model is the SDC with 4 freezes.
-    host, port : address of the page; port 0: a free one.
+    port : of the page, on this machine; 0: a free one.
 
     Attributes
     ----------
@@ -61,10 +61,10 @@ class CollisionPage(LivePage):
     Raises
     ------
     InputError : viser is missing; a problem with two strikers, a supporting hand, friction or a soft grip;
-        host or port are not available.
+        the port is not available.
     """
 
-    def __init__(self, problem: ImpactProblem, *, host: str = LOCAL, port: int = 0) -> None:
+    def __init__(self, problem: ImpactProblem, *, port: int = 0) -> None:
         self.problem, c = problem, problem.coordinates
         if problem.second is not None or c.hands or problem.friction is not None:
             raise InputError(
@@ -78,7 +78,7 @@ class CollisionPage(LivePage):
         self._y, self._legs = c.split(problem.contact_posture)
         self._polygon = support_polygon(problem.robot, c)
         self._model = SDC(**problem.scene, freezes=_FREEZES)
-        self._server, self.address = served(host, port)
+        self._server, self.address = served(port)
         self._drawing = Drawing(self._server, problem.robot, problem.ground_height)
         self._drawing.normal = problem.normal
         self._drawing.polygon(self._polygon)

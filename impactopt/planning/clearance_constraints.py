@@ -373,13 +373,8 @@ class _Approach(NamedTuple):
     missed: bool
 
 
-def clearance_violations(
-    solution: Evaluation[Transcription], margins: Margins, *, share: float = LOST_BETWEEN_NODES
-) -> ClearanceViolations | None:
-    """Clearance violations of a solution, at its nodes or between them; None if there are none.
-
-    share : part of its margin that a pair loses, by exact geometry, in a violation.
-    """
+def clearance_violations(solution: Evaluation[Transcription], margins: Margins) -> ClearanceViolations | None:
+    """Clearance violations of a solution, at its nodes or between them; None if there are none."""
     t, plan, bodies = solution.program, solution.planned, margins.bodies
     approaches = list[tuple[Pair, _Approach]]()
     # The motion after a missed target exists only with an abort motion.
@@ -391,7 +386,7 @@ def clearance_violations(
         at = Places.of(t.robot, motion.q, phase, motion.displacement)
         approaches += [
             (pair, _Approach(distance, float(motion.time[k]), missed))
-            for k, pair, distance in _near(margins, at, share)
+            for k, pair, distance in _near(margins, at, LOST_BETWEEN_NODES)
         ]
     if not approaches:
         return None

@@ -41,6 +41,7 @@ from impactopt.planning.refinement import Attempt, Outcome
 from impactopt.problem.feasibility import overlapping
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads, weight_of
+from impactopt.simulation.collision_geometry import UnintendedContact
 from impactopt.simulation.result import check_simulations
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_refinement import ContactError, finest
@@ -369,11 +370,8 @@ class Solution(Solved):
             found = bodies.survey(motion.time, at)
             if found.clearance < least:
                 least, nearest = found.clearance, " and ".join(found.nearest)
-            for one, other, start, end, depth in found.touches:
-                touches.append(
-                    {"one": one, "other": other, "start_s": start, "end_s": end, "depth_mm": 1e3 * depth}
-                    | ({"missed": True} if missed else {})
-                )
+            contacts = (UnintendedContact(**touch._asdict()).summary() for touch in found.touches)
+            touches += [contact | ({"missed": True} if missed else {}) for contact in contacts]
         return least, nearest, touches
 
     @cached_property

@@ -103,16 +103,8 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation, distance: flo
     survey = bodies.survey(time[chosen], at)
     touched = simulation.touched
     if simulation.fall is None or not problem.keeps_apart:  # the engine had no solids that collide
-        touched = tuple(
-            UnintendedContact(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth)
-            for t in survey.touches
-        )
-    return replace(
-        simulation,
-        clearance=survey.clearance,
-        nearest=survey.nearest,
-        touched=touched,
-    )
+        touched = tuple(UnintendedContact(**touch._asdict()) for touch in survey.touches)
+    return replace(simulation, clearance=survey.clearance, nearest=survey.nearest, touched=touched)
 
 
 def _sampled(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:

@@ -36,6 +36,7 @@ from impactopt.files.sections.values import (
     optional,
     required,
     section_of,
+    usual,
 )
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, FixedBase, Free, OneSole, Stance
 from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
@@ -54,9 +55,7 @@ class Target(Section):
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "target_kind"
     apart: ClassVar[tuple[str, ...]] = ("body",)
-    target_kind: TargetKind = Field(
-        default=targets.TARGETS[0].word, alias="kind", description="kind of target"
-    )
+    target_kind: TargetKind = usual(targets.TARGETS[0].word, "kind of target", "kind")
     body: Body = optional("")
 
 
@@ -71,7 +70,7 @@ class Contact(Section):
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "law"
-    law: LawKind = Field(default=laws.LAWS[0].word, description="contact law")
+    law: LawKind = usual(laws.LAWS[0].word, "contact law")
 
 
 class _KnownContact(Contact):
@@ -118,22 +117,15 @@ class ProblemSection(Section):
         "hit point: x forward, y left, z up from the ground, or from a fixed base [m]", "point_m"
     )
     normal: UnitVector = required("direction in which the target is pushed")
-    start: Posture = Field(
-        default=USUAL_POSTURE,
-        description="start posture: its name, or a configuration of Pinocchio",
-    )
+    start: Posture = usual(USUAL_POSTURE, "start posture: its name, or a configuration of Pinocchio")
 
 
 class StanceSection(Section):
     """Fixed soles, and supporting hands."""
 
-    soles: str = Field(
-        default="both",
-        description='"both", or one; "none": the robot floats freely',
-    )
-    hands: HandNames = Field(
-        default=[],
-        description="strikers that are fixed at their places in the start posture; see [terms.grip]",
+    soles: str = usual("both", '"both", or one; "none": the robot floats freely')
+    hands: HandNames = usual(
+        [], "strikers that are fixed at their places in the start posture; see [terms.grip]"
     )
 
 

@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from impactopt.arrays import Array, Index
 from impactopt.collide.contact_states import ContactStates, States
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.rigid import RigidImpact
@@ -33,8 +33,6 @@ from impactopt.problem.checks import MOST_FREEZES
 from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import Status
-
-Array = NDArray[np.float64]
 
 NOT_ENDED = (
     "the contact has not ended at the horizon; raise it: at_contact.horizon_s, or --horizon of `impactopt "
@@ -145,7 +143,7 @@ def collision_model(
 _INSTANTS = 10
 
 
-def finer(model: CollisionModel, durations: Array) -> Iterator[tuple[CollisionModel, NDArray[np.intp]]]:
+def finer(model: CollisionModel, durations: Array) -> Iterator[tuple[CollisionModel, Index]]:
     """Models with `_INSTANTS` in contacts of these durations (N) [s], each with the indices of its contacts.
 
     There are none for contacts in which the model itself has so many.

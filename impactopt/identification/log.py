@@ -14,12 +14,12 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import trapezoid
 
+from impactopt.arrays import Array
 from impactopt.codegen.files import read_archive
 from impactopt.errors import MOST, InputError, check_array, check_direction, counted, did_you_mean, shortened
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 TIME, FORCE, SPEED = "time_s", "force_N", "hand_speed_m_s"
 # bytes and arrays of an npz file: an hour of 15 columns at 1 kHz has 430 MB
 MAX_BYTES, MAX_ARRAYS = 1 << 29, 1000

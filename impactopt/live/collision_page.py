@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.collide.contact_states import NOT_APPROACHING
 from impactopt.collide.single_collision import finer, meets_again, zmp_margins
 from impactopt.collision import SDC, Collision
@@ -25,7 +25,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import drawn_ranges
 from impactopt.report.tracks import places_of
 
-Array = NDArray[np.float64]
 _MIN_SPEED, _FIRST_SPEED, _MAX_SPEED = 0.05, 1.0, 4.0  # [m/s]
 _SLIDER_STEPS = 200
 _FREEZES = 4

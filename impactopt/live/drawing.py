@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from impactopt.arrays import Array
 from impactopt.bodies.solids import cylinder
 from impactopt.bodies.visuals import Part, surroundings_of
 from impactopt.bodies.world import face_axes
@@ -16,8 +16,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.stage import bodies_drawn
 from impactopt.report.tracks import Track
 from impactopt.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.clearance import DEEPEST, MISSED, SLACK, Bodies, Places
 from impactopt.bodies.robot_bodies import NEIGHBOUR_JOINTS, Pair
 from impactopt.bodies.separation import ROUNDING, Looked, Placed
@@ -36,7 +37,6 @@ from impactopt.transcription.mesh import MoreNodes
 from impactopt.transcription.plan import COARSE_STEP, Plan
 from impactopt.transcription.transcription import Transcription
 
-Array = NDArray[np.float64]
 Constraints = dict[ClearanceKey, SeparatingDirection]
 IN_CONTACT, AFTER_CONTACT = 1, 2  # phases, as of `Places.phase`
 # [m] An iterate with an unconstrained pair nearer than TRIGGER interrupts the solve. Then all pairs nearer

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid, trapezoid
 
 from impactopt import __version__
+from impactopt.arrays import Array
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, counted
 from impactopt.planning.bounds import Cause
@@ -49,7 +49,6 @@ from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares, c
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, Trajectory, motion_loads
 from impactopt.transcription.transcription import Transcription, block_functions
 
-Array = NDArray[np.float64]
 REVERSAL = 0.02  # [rad] by which a joint has to move back to count as a reversal
 TOUCH_WINDOW, TOUCH_STEP = 0.05, 2.5e-4  # [s] time before contact that is searched for a touch, and step
 

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.clearance import Bodies
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.world import (
@@ -57,7 +58,6 @@ from impactopt.robots.attachments import Sole
 from impactopt.robots.gains import GainFactor
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 __all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
 
 AnyTerm = TypeVar("AnyTerm", bound=Term)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.contact.fields import Described, about, abouts, described
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, RigidWall, Target
@@ -24,8 +24,6 @@ from impactopt.errors import (
 )
 from impactopt.problem.objectives import PeakForce, Penetration
 from impactopt.problem.terms import HitCone, HitRegion, Slide
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

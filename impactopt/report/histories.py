@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.files.record import Record
 from impactopt.kinematics.stance import convex_polygon, margin
 from impactopt.simulation.result import centre_of_pressure
 
-Array = NDArray[np.float64]
 BUCKETS = 400  # of a thinned history
 
 

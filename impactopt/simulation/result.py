@@ -11,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
+from impactopt.arrays import Array, Mask
 from impactopt.contact.friction import ContactFriction, moves_target
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
@@ -20,7 +21,6 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import Solids, UnintendedContact
 from impactopt.simulation.motors import MotorCut
 
-Array = NDArray[np.float64]
 FACE = 0.2  # [m] radius of the target's surface about where it may be hit, across the normal
 MAX_GAP = 5e-3  # [s] between touches that belong to one impact
 PHASES = ("swing", "collision", "follow")
@@ -108,7 +108,7 @@ class Scene:
     hands: tuple[str, ...] = ()
     friction: ContactFriction | None = None
     second: tuple[str, Array] | None = None
-    standing: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    standing: Mask = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     polygons: tuple[Array, ...] = ()
     face: float = FACE
 
@@ -227,7 +227,7 @@ class Simulation:
     grip_force: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     impulses: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     stance: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
-    stands: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool), repr=False)
+    stands: Mask = field(default_factory=lambda: np.zeros((0, 0), dtype=bool), repr=False)
     polygons: tuple[Array, ...] = field(default=(), repr=False)
     landing_speed: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     target_aside: Array = field(default_factory=lambda: np.zeros((0, 3)), repr=False)

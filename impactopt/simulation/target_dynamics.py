@@ -8,14 +8,13 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from impactopt.arrays import Array
 from impactopt.contact.friction import ContactFriction, deflection_rate, lean
 from impactopt.errors import InputError
 from impactopt.simulation.result import FACE, Scene
 
-Array = NDArray[np.float64]
 MAX_SWITCHES = 20  # of a target within one step
 BISECTIONS = 30  # of a step, to locate a switch, or a begin or end of contact
 # Tolerances of the contact within a step. The absolute one is in m, N s and units of the target's state.

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.convex_hulls import seen_pieces
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.errors import InputError, counted
@@ -46,7 +47,6 @@ from impactopt.robots.checks import REPAIRED
 from impactopt.robots.gains import USUAL_ROTOR
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 MAX_TARGETS = 8  # tried
 MAX_MOTIONS = 2  # whole motions of a bolted arm that are compared
 # A strike is planned for if its objective is at least so much of the hardest motion's.

@@ -9,6 +9,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from impactopt.arrays import Array
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
@@ -19,7 +20,6 @@ from impactopt.robots.checks import LEG
 from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot, Sole
 
-Array = NDArray[np.float64]
 SQUAT = 0.06  # lowering of the hips, over the length of the legs
 LEVEL = 1e-5  # [m], [rad]: tolerance of a sole's placement, to which angles are written and files have axes
 STARTS = 10  # random initial guesses

@@ -12,12 +12,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.files.export.content import Export, body_name
 from impactopt.files.export.motion import Motion, motion_at
 from impactopt.robots.model import JointAngles
-
-Array = NDArray[np.float64]
 
 
 def write(export: Export, directory: Path) -> None:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import BPoly, PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from impactopt.arrays import Array, Mask
 from impactopt.kinematics.stance import zmp
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
 
-Array = NDArray[np.float64]
 JUMP = 1e-6  # [s] between the two samples at a jump, so that time is strictly ascending
 CONTACT = 1  # phase
 
@@ -138,7 +138,7 @@ def _stances(reference: Trajectory, time: Array) -> NDArray[np.intp] | None:
     return reference.stance[samples.clip(0)]
 
 
-def with_passive_at_rest(motion: Motion, passive: NDArray[np.bool_]) -> Motion:
+def with_passive_at_rest(motion: Motion, passive: Mask) -> Motion:
     """The motion with constant references of passive joints (n,): position and effort are those at the start.
 
     They have no servos.

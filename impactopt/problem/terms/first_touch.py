@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.robot_bodies import StrikerFace, striker_face
 from impactopt.contact.fields import described
 from impactopt.kinematics.coordinates import StanceCoordinates
@@ -17,7 +17,6 @@ from impactopt.problem.terms.base import Term
 from impactopt.problem.terms.hand_orientation import HandOrientation
 from impactopt.problem.violation import degrees, millimetres
 
-Array = NDArray[np.float64]
 # [s] The constraints hold in this time before contact. Earlier, only the striking point stays behind the
 # target's plane.
 SINCE = 0.12

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 from scipy.spatial import ConvexHull
 
+from impactopt.arrays import Array
 from impactopt.bodies.visuals import surroundings_of
 from impactopt.files.output import check_ending, write_file
 from impactopt.files.replay import Replay
 from impactopt.kinematics.stance import corners_at
-from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION, Array
+from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION
 from impactopt.robots.loads import MIN_LOAD_FRACTION, weight_of
 from impactopt.simulation import scene_of
 from impactopt.simulation.reference.poses import bones

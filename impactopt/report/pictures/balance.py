@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.files.record import Record
 from impactopt.kinematics.stance import zmp
 from impactopt.report.histories import footprints
@@ -24,7 +25,6 @@ from impactopt.report.pictures.style import (
     OVER,
     PHASES,
     RIGHT,
-    Array,
     picture,
     simulated_parts,
 )

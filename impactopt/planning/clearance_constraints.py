@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from impactopt.arrays import Array
+from impactopt.arrays import Array, Mask
 from impactopt.bodies.clearance import DEEPEST, MISSED, SLACK, Bodies, Places
 from impactopt.bodies.robot_bodies import NEIGHBOUR_JOINTS, Pair
 from impactopt.bodies.separation import ROUNDING, Looked, Placed
@@ -264,7 +263,7 @@ class Watch:
         return at, self._shapes.look(at, exact_within, directions, self._margins.wanted, before)
 
     # ------------------------------------------------------------------ clearance violations
-    def _bare(self, found: Looked, within: Array | float) -> NDArray[np.bool_]:
+    def _bare(self, found: Looked, within: Array | float) -> Mask:
         """Mask (m,) of the pairs found that are nearer than ``within`` [m], a number or (P,), and have no
         constraint.
         """

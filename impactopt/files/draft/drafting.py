@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from impactopt.arrays import Array
+from impactopt.arrays import Array, Mask
 from impactopt.bodies.convex_hulls import seen_pieces
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.errors import InputError, counted
@@ -696,7 +695,7 @@ def _wrong(drafted: Drafted) -> str:
     return f"{counted(len(drafted.wrong), 'inertia is', 'inertias are')} not physical"
 
 
-def _guessed_gains(robot: Robot) -> NDArray[np.bool_]:
+def _guessed_gains(robot: Robot) -> Mask:
     """Mask (n,) of joints whose gains are the defaults of a description without gains."""
     damping, stiffness = default_kd(robot.torque_limit), default_kp(robot.kd)
     return np.isclose(robot.kd, damping) & np.isclose(robot.kp, stiffness) & ~robot.hinges

@@ -16,10 +16,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.arrays import Array, Index
+from impactopt.arrays import Array, Index, Mask
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
@@ -137,7 +136,7 @@ class Export:
     motion: Motion
     missed: Motion | None
 
-    def standing(self, motion: Motion) -> dict[str, NDArray[np.bool_]]:
+    def standing(self, motion: Motion) -> dict[str, Mask]:
         """Mask (k,) of the instants at which each sole stands, by its name; {} without stance phases."""
         p = self.problem
         if motion.stance is None:

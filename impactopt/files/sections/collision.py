@@ -10,10 +10,9 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, PlainValidator, create_model
 
+from impactopt.arrays import Array
 from impactopt.bodies.world import TargetBody
 from impactopt.contact import laws, targets
 from impactopt.contact.friction import ContactFriction
@@ -275,7 +274,7 @@ class CollisionSections(Section):
         stance.constraint_frames(robot)
         return stance
 
-    def stance_at_impact(self, robot: Robot) -> tuple[Stance, NDArray[np.float64]]:
+    def stance_at_impact(self, robot: Robot) -> tuple[Stance, Array]:
         """Stance of a robot at the impact, and a posture (nq,) in which its soles stand where they do then.
 
         They are those of the phase with the impact in [[stances]], after its steps, or of [stance] and the
@@ -300,7 +299,7 @@ class CollisionSections(Section):
                 "[second]: a collision model has one striker: leave the section out, or solve the problem"
             )
 
-    def make_start(self, robot: Robot) -> NDArray[np.float64]:
+    def make_start(self, robot: Robot) -> Array:
         """The start posture (nq,); InputError for one that the robot cannot have."""
         start = self.problem.start
         return (

@@ -162,7 +162,6 @@ class CollisionPage(LivePage):
         self._drawing.largest = max(self._drawing.largest, force)
         self._drawing.draw(
             Moment(
-                time=0.0,
                 place=places[0, :, :3],
                 turn=places[0][:, [6, 3, 4, 5]],  # Pinocchio has w last, viser first
                 hand=hand[0],

@@ -27,7 +27,7 @@ from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_edge, find_striker, find_toe
 from impactopt.files.draft.strong import FOLLOW, ITERATIONS, SECONDS, SWING, Strong, durations, strongest
 from impactopt.files.draft.target_placement import STRIKE_DIRECTIONS, Arm, aims, ready
-from impactopt.files.problem_file.reading import problem_file_from_data
+from impactopt.files.problem_file.reading import ProblemFile
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.writing import ROBOT_KEYS, relative_path, section_data, sole_data
 from impactopt.files.sections.robot import StrikerSection, ToolSection
@@ -568,7 +568,7 @@ def _aimed(
 def _built(data: dict[str, Any], folder: Path) -> ImpactProblem:
     """The problem of drafted data, with repaired inertias."""
     tried = {**data, "robot": {**data["robot"], "inertias": REPAIRED}}
-    return problem_file_from_data(tried, where=folder / "draft.toml").build()
+    return ProblemFile.from_data(tried, folder / "draft.toml").build()
 
 
 def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:

@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.codegen.batched import BatchedFunction
 from impactopt.codegen.cache import cached, model_hash
 from impactopt.collision.frozen import _inverse_of_cholesky
@@ -135,7 +136,6 @@ def _column(*parts: Any) -> Any:
     return ca.densify(ca.vertcat(*[ca.vec(part) for part in parts]))
 
 
-Array = NDArray[np.float64]
 Reasons = NDArray[np.object_]
 
 _BLOCK = 256  # states in one call of a compiled function
@@ -195,7 +195,7 @@ class States:
         flees = (self.reason == "") & (self.speed <= before)
         return replace(self, reason=np.where(flees, NOT_APPROACHING, self.reason))
 
-    def some(self, cases: NDArray[np.intp]) -> States:
+    def some(self, cases: Index) -> States:
         """States of the cases with these indices."""
         kept: dict[str, Any] = {name: None if x is None else x[cases] for name, x in vars(self).items()}
         return States(**kept)
@@ -410,6 +410,6 @@ class ContactStates:
         return striking_functions(self.robot, striker=self.striker, stance=self.stance)
 
 
-def _set_reason(reason: Reasons, where: NDArray[np.bool_], text: str) -> None:
+def _set_reason(reason: Reasons, where: Mask, text: str) -> None:
     """Sets the reason where there is none yet."""
     reason[where & (reason == "")] = text

@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from impactopt.arrays import Array, Index
 from impactopt.collide.contact_states import ContactStates, States
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.rigid import RigidImpact
@@ -33,8 +33,6 @@ from impactopt.problem.checks import MOST_FREEZES
 from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import Status
-
-Array = NDArray[np.float64]
 
 NOT_ENDED = (
     "the contact has not ended at the horizon; raise it: at_contact.horizon_s, or --horizon of `impactopt "
@@ -145,7 +143,7 @@ def collision_model(
 _INSTANTS = 10
 
 
-def finer(model: CollisionModel, durations: Array) -> Iterator[tuple[CollisionModel, NDArray[np.intp]]]:
+def finer(model: CollisionModel, durations: Array) -> Iterator[tuple[CollisionModel, Index]]:
     """Models with `_INSTANTS` in contacts of these durations (N) [s], each with the indices of its contacts.
 
     There are none for contacts in which the model itself has so many.
@@ -186,12 +184,11 @@ class CollisionResults:
     polygon: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Measure:
-    """Column of the table of collisions: required outputs, description, and its values (N) from a batch."""
+    """Column of the table of collisions: required outputs, and its values (N) from a batch."""
 
     outputs: tuple[str, ...]
-    what: str
     of: Callable[[CollisionResults], Array]
 
 
@@ -224,52 +221,19 @@ def _zmp_margin(batch: CollisionResults) -> Array:
     return np.asarray(inside.reshape(ground.shape[:2]).min(axis=1))
 
 
+# Least and largest values are over every millisecond of contact, and ten instants at least.
 MEASURES: Mapping[str, Measure] = {
-    "impulse_Ns": Measure(
-        outputs=("impulse",), what="delivered to the target", of=lambda b: b.found["impulse"]
-    ),
-    "peak_force_N": Measure(
-        outputs=("peak_force",), what="largest contact force", of=lambda b: b.found["peak_force"]
-    ),
-    "contact_ms": Measure(
-        outputs=("duration",), what="from contact to separation", of=lambda b: 1e3 * b.found["duration"]
-    ),
-    "energy_J": Measure(outputs=("energy",), what="given to the target", of=lambda b: b.found["energy"]),
-    "torque_ratio": Measure(
-        outputs=("demand",),
-        what="largest torque demand over its joint's limit, at every millisecond of contact and ten "
-        "times at least",
-        of=_torque_ratio,
-    ),
-    "zmp_margin_m": Measure(
-        outputs=("ground_wrench",),
-        what="least distance of the ZMP from the soles' hull, positive inside, at every millisecond of "
-        "contact and ten times at least; minus infinity where they carry no load, or would have to pull",
-        of=_zmp_margin,
-    ),
-    "sole_force_N": Measure(
-        outputs=("sole_wrench",),
-        what="least vertical force of the ground on one sole, at every millisecond of contact and ten times "
-        "at least",
-        of=lambda b: b.found["sole_wrench"][..., 2].min(axis=(1, 2)),
-    ),
-    "freeze_error_pct": Measure(
-        outputs=("freeze_error",),
-        what="estimated error of the impulse by freezing; 0 of full dynamics, nan of models with larger "
-        "errors of another kind",
-        of=lambda b: 100 * b.found["freeze_error"],
-    ),
-    "hand_speed_m_s": Measure(
-        outputs=(), what="of the striking point along the normal, at contact", of=lambda b: b.states.speed
-    ),
-    "effective_mass_kg": Measure(
-        outputs=(),
-        what="of the constrained robot at the striking point along the normal",
-        of=lambda b: b.states.mass,
-    ),
-    "velocity_ratio": Measure(
-        outputs=(), what="largest joint speed at contact over its limit", of=_velocity_ratio
-    ),
+    "impulse_Ns": Measure(("impulse",), lambda b: b.found["impulse"]),
+    "peak_force_N": Measure(("peak_force",), lambda b: b.found["peak_force"]),
+    "contact_ms": Measure(("duration",), lambda b: 1e3 * b.found["duration"]),
+    "energy_J": Measure(("energy",), lambda b: b.found["energy"]),
+    "torque_ratio": Measure(("demand",), _torque_ratio),
+    "zmp_margin_m": Measure(("ground_wrench",), _zmp_margin),
+    "sole_force_N": Measure(("sole_wrench",), lambda b: b.found["sole_wrench"][..., 2].min(axis=(1, 2))),
+    "freeze_error_pct": Measure(("freeze_error",), lambda b: 100 * b.found["freeze_error"]),
+    "hand_speed_m_s": Measure((), lambda b: b.states.speed),
+    "effective_mass_kg": Measure((), lambda b: b.states.mass),
+    "velocity_ratio": Measure((), _velocity_ratio),
 }
 
 
@@ -301,19 +265,17 @@ def _result(k: int) -> Measure:
         result: Any = batch.found["target_result"]
         return np.asarray(result[:, k])
 
-    return Measure(outputs=("target_result",), what="of the target after the collision", of=of)
+    return Measure(("target_result",), of)
 
 
 _CONTACT_DOES_NOT_END = (
     "the contact of the result does not end with this model: its freezes are placed by the duration that the "
-    "first "
-    "one predicts, which is far too short here; take the full dynamics (--model full)"
+    "first one predicts, which is far too short here; take the full dynamics (--model full)"
 )
 # causes of differences between a model and the plan, and which of the two to trust
 _MODEL_ERRORS = {
     "sdc": "H, J, the bias and the acceleration of the servo's reference are frozen {}; its differences from "
-    "the "
-    "plan and the replays are errors of this model",
+    "the plan and the replays are errors of this model",
     "sdc-paper": "it has no servo stiffness, no feed-forward torque, no bias and no dJ/dt v: for ZMP, "
     "forces on soles and torques trust the plan and its replays",
     "virtual-mass": "a point mass without servo: trust the plan and its replays",

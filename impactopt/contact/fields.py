@@ -95,6 +95,14 @@ def about(what: str, **more: Any) -> dict[str, About]:
     return {_METADATA: About(what=what, **more)}
 
 
+def described(default: Any, what: str, **more: Any) -> Any:
+    """Field with a default and a description, ``margin: float = described(0.02, "distance", unit="m")``.
+
+    what, more : as of `About`.
+    """
+    return dataclasses.field(default=default, metadata=about(what, **more))
+
+
 def abouts(kind: type) -> Iterator[tuple[dataclasses.Field[Any], About]]:
     """Fields of a dataclass that have a description."""
     for field in dataclasses.fields(kind):

@@ -18,7 +18,7 @@ import numpy as np
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.output import replay_arrays
-from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
+from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.record import Record, load_record, plain
 from impactopt.planning.gain_selection import ChosenGains, with_chosen
 from impactopt.planning.lazy_constraints import gear_caution, with_lazy_constraints
@@ -240,7 +240,7 @@ def _problem_file(
         raise InputError(f"{result} holds no problem file: give it with --problem FILE")
     path = record.problem_path or result / "problem.toml"
     try:
-        return parse_problem_file(record.problem, path, settings)
+        return ProblemFile.parse(record.problem, path, settings)
     except InputError as error:
         raise _cannot_rebuild(result, error) from error
 

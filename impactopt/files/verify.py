@@ -34,7 +34,6 @@ from impactopt.solvers.program import (
 )
 from impactopt.transcription.transcription import Transcription, statement_of
 
-Array = NDArray[np.float64]
 VIOLATION = 1e-5  # of constraints, which are of order one, and of recorded numbers
 KKT = 1e-4  # as of solvers that call a point acceptable
 OBJECTIVE_TOLERANCE = 1e-9  # relative to the objective's size, at least to one

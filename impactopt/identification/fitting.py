@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
+from impactopt.arrays import Array
 from impactopt.collision.sdc import VirtualMass
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass
@@ -22,7 +22,6 @@ from impactopt.identification.log import MeasuredImpact, noise_of
 from impactopt.identification.result import Estimate, LawFit
 from impactopt.robots.robot import Robot, Striker
 
-Array = NDArray[np.float64]
 _HEAVY = 1e6  # [kg] of the mass that hardly moves
 MAX_HAND_MASS = 1e5  # [kg]
 _INSTANTS = 1500  # of a history, over its horizon

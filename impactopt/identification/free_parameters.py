@@ -7,14 +7,13 @@ from dataclasses import dataclass, fields
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw, CustomLaw
 from impactopt.errors import InputError
 from impactopt.identification.log import MeasuredImpact
 
-Array = NDArray[np.float64]
 MASS = "effective_mass"
 _MAX_LOG = 14.0  # bound of z of a logarithmic parameter: a factor of a million from the estimate
 _ZERO = 1e-9  # below, z counts as 0: laws refuse parameters that are nearly 0

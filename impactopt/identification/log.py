@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import trapezoid
 
+from impactopt.arrays import Array, Mask
 from impactopt.codegen.files import read_archive
 from impactopt.errors import MOST, InputError, check_array, check_direction, counted, did_you_mean, shortened
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 TIME, FORCE, SPEED = "time_s", "force_N", "hand_speed_m_s"
 # bytes and arrays of an npz file: an hour of 15 columns at 1 kHz has 430 MB
 MAX_BYTES, MAX_ARRAYS = 1 << 29, 1000
@@ -258,7 +258,7 @@ class MeasuredImpact:
     time: Array
     force: Array
     motion: Array
-    clipped: NDArray[np.bool_]
+    clipped: Mask
     travels: bool
     touch: int
     duration: float
@@ -272,7 +272,7 @@ class MeasuredImpact:
         return float(self.force.max())
 
 
-def _clipped(force: Array, noise: float) -> NDArray[np.bool_]:
+def _clipped(force: Array, noise: float) -> Mask:
     """Mask (k,) of the samples of a log whose force is cut off: those at a flat top; noise : of the force."""
     top = float(force.max())
     at_top = force >= top - max(_NOISE_FRACTION * noise, _PEAK_FRACTION * top)
@@ -366,7 +366,7 @@ def _impact(
     span: tuple[int, int],
     spans: list[tuple[int, int]],
     noise: float,
-    clipped: NDArray[np.bool_],
+    clipped: Mask,
 ) -> MeasuredImpact:
     """Impact from the span of its samples, and all spans of the log.
 

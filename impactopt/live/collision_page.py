@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.collide.contact_states import NOT_APPROACHING
 from impactopt.collide.single_collision import finer, meets_again, zmp_margins
 from impactopt.collision import SDC, Collision
@@ -20,12 +20,11 @@ from impactopt.kinematics.operational_space import holding_torque, striking_velo
 from impactopt.kinematics.stance import support_polygon
 from impactopt.live.drawing import Drawing, Moment
 from impactopt.live.requests import LatestRequest
-from impactopt.live.server import LOCAL, LivePage, served
+from impactopt.live.server import LivePage, served
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import drawn_ranges
 from impactopt.report.tracks import places_of
 
-Array = NDArray[np.float64]
 _MIN_SPEED, _FIRST_SPEED, _MAX_SPEED = 0.05, 1.0, 4.0  # [m/s]
 _SLIDER_STEPS = 200
 _FREEZES = 4
@@ -51,7 +50,7 @@ class CollisionPage(LivePage):
 
     problem : its robot, stance, contact law and target; the first posture reaches its point. The soles stay
         in place, as the legs follow by inverse kinematics. The model is the SDC with 4 freezes.
-    host, port : address of the page; port 0: a free one.
+    port : of the page, on this machine; 0: a free one.
 
     Attributes
     ----------
@@ -61,10 +60,10 @@ class CollisionPage(LivePage):
     Raises
     ------
     InputError : viser is missing; a problem with two strikers, a supporting hand, friction or a soft grip;
-        host or port are not available.
+        the port is not available.
     """
 
-    def __init__(self, problem: ImpactProblem, *, host: str = LOCAL, port: int = 0) -> None:
+    def __init__(self, problem: ImpactProblem, *, port: int = 0) -> None:
         self.problem, c = problem, problem.coordinates
         if problem.second is not None or c.hands or problem.friction is not None:
             raise InputError(
@@ -78,7 +77,7 @@ class CollisionPage(LivePage):
         self._y, self._legs = c.split(problem.contact_posture)
         self._polygon = support_polygon(problem.robot, c)
         self._model = SDC(**problem.scene, freezes=_FREEZES)
-        self._server, self.address = served(host, port)
+        self._server, self.address = served(port)
         self._drawing = Drawing(self._server, problem.robot, problem.ground_height)
         self._drawing.normal = problem.normal
         self._drawing.polygon(self._polygon)
@@ -163,7 +162,6 @@ class CollisionPage(LivePage):
         self._drawing.largest = max(self._drawing.largest, force)
         self._drawing.draw(
             Moment(
-                time=0.0,
                 place=places[0, :, :3],
                 turn=places[0][:, [6, 3, 4, 5]],  # Pinocchio has w last, viser first
                 hand=hand[0],

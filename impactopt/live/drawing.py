@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from impactopt.arrays import Array
 from impactopt.bodies.solids import cylinder
 from impactopt.bodies.visuals import Part, surroundings_of
 from impactopt.bodies.world import face_axes
@@ -17,18 +17,15 @@ from impactopt.report.stage import bodies_drawn
 from impactopt.report.tracks import Track
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moment:
-    """State of a motion at one time, as in :class:`~impactopt.report.tracks.Track`.
+    """State at one time of a motion, as in :class:`~impactopt.report.tracks.Track`.
 
     place (joints, 3) [m], turn (joints, 4) : placements of the joints in the world, with quaternions w, x, y,
     z.
     """
 
-    time: float
     place: Array
     turn: Array
     hand: Array
@@ -56,7 +53,6 @@ def moment_of(track: Track, time: float) -> Moment:
     turn = (1 - fraction) * one + fraction * sign * other
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     return Moment(
-        time=at,
         place=interpolated(track.places[:, :, :3]),
         turn=turn[:, [3, 0, 1, 2]],  # w first
         hand=interpolated(track.hand),

@@ -13,7 +13,7 @@ from impactopt.errors import InputError
 from impactopt.live.drawing import Drawing, moment_of
 from impactopt.live.replanning import MAX_VIOLATIONS, Answer, Replanning
 from impactopt.live.requests import LatestRequest, PlanRequest, request_of, slider_parameters
-from impactopt.live.server import LOCAL, LivePage, served
+from impactopt.live.server import LivePage, served
 from impactopt.planning.solution import Solution, impact_summary
 from impactopt.report.stage import middle
 from impactopt.report.tracks import Track
@@ -26,7 +26,7 @@ SPEEDS = {"1": 1.0, "1/4": 0.25, "1/20": 0.05}  # of the motion over the real on
 class PlanPage(LivePage):
     """Page of a plan, served until it is closed.
 
-    first : first plan.  host, port : address of the page; port 0: a free one.
+    first : first plan.  port : of the page, on this machine; 0: a free one.
 
     Attributes
     ----------
@@ -36,10 +36,10 @@ class PlanPage(LivePage):
 
     Raises
     ------
-    InputError : viser is missing; host or port are not available; the first plan is not a solution.
+    InputError : viser is missing; the port is not available; the first plan is not a solution.
     """
 
-    def __init__(self, first: Solution, *, host: str = LOCAL, port: int = 0) -> None:
+    def __init__(self, first: Solution, *, port: int = 0) -> None:
         if not first.status.usable:
             raise InputError(
                 f"this plan is not a solution ({first.status.value}) and cannot be re-planned: solve it first"
@@ -47,7 +47,7 @@ class PlanPage(LivePage):
         self.first, self.request = first, request_of(first.problem)
         replanning = Replanning(first)
         self.answer = replanning(self.request, lambda: False)
-        self._server, self.address = served(host, port)
+        self._server, self.address = served(port)
         # viser calls from several threads: locks of the scene, and of the request
         self._scene_lock, self._request_lock = threading.RLock(), threading.RLock()
         self._drawing = Drawing(self._server, first.problem.robot, first.problem.ground_height)

@@ -45,9 +45,8 @@ class Replanning:
     a plain reach, if that is the plan from which re-planning has failed.
     """
 
-    def __init__(self, first: Solution, *, time_limit: float = TIME_LIMIT) -> None:
+    def __init__(self, first: Solution) -> None:
         self.first = self.latest = first
-        self.time_limit = time_limit
         # builds what re-planning needs now, and not when the first slider moves
         with contextlib.suppress(InputError):
             moved_solution(first, point=first.problem.point)
@@ -75,7 +74,7 @@ class Replanning:
         def stop(_: IterationRecord) -> bool:
             return stale()
 
-        brief, moved = REPLANNING_SHARE * self.time_limit, None
+        brief, moved = REPLANNING_SHARE * TIME_LIMIT, None
         # the program has other constraints; or the problem is wrong, and the solve below raises again
         with contextlib.suppress(InputError):
             moved = moved_solution(self.first, **changes, callback=stop, time_limit=brief)
@@ -84,7 +83,7 @@ class Replanning:
         problem = moved_problem(self.first.problem, **changes)
         # so far from a plan a warm start takes longer than none
         start = "reach" if moved is not None and self.latest is self.first else self.latest
-        rest = self.time_limit - brief
+        rest = TIME_LIMIT - brief
         return solve(problem, start=start, options=REPLANNING_TOLERANCES, callback=stop, time_limit=rest)
 
 

@@ -45,19 +45,15 @@ class LivePage:
         self.close()
 
 
-def _family(host: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
-
-
-def served(host: str, port: int) -> tuple[Any, str]:
-    """`viser.ViserServer` at a host and port (0: a free one), and the address of its page.
+def served(port: int) -> tuple[Any, str]:
+    """`viser.ViserServer` on this machine at a port (0: a free one), and the address of its page.
 
     The address ends in a random token. Requests without it, and those from a page of another origin in the
     same browser, are refused: only those who know the address can see the page.
 
     Raises
     ------
-    InputError : viser is missing, or has no check of requests; host or port are not available.
+    InputError : viser is missing, or has no check of requests; the port is not available.
     """
     try:
         import viser
@@ -65,19 +61,19 @@ def served(host: str, port: int) -> tuple[Any, str]:
         raise missing_package("a live look", "viser", "live") from error
     # viser would silently take another port if this one is in use
     try:
-        with socket.create_server((host, port), family=_family(host)):
+        with socket.create_server((LOCAL, port)):
             pass
     except (OSError, OverflowError) as error:
         taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
-        fix = "give another --port, or none" if taken else "give another host or port"
-        raise InputError(f"cannot serve a page at {host}:{port}: {error}; {fix}") from error
+        fix = "give another --port, or none" if taken else "give another --port"
+        raise InputError(f"cannot serve a page at {LOCAL}:{port}: {error}; {fix}") from error
     token = secrets.token_hex(16)
     with _guarded(token) as guards, contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
-        server = viser.ViserServer(host=host, port=port, label="impactopt", verbose=False)
+        server = viser.ViserServer(host=LOCAL, port=port, label="impactopt", verbose=False)
         if not guards:
             server.stop()
             raise InputError(f"viser {viser.__version__} lets no request be checked; install viser 1.1")
-    return server, f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/{token}"
+    return server, f"http://{LOCAL}:{server.get_port()}/{token}"
 
 
 @contextlib.contextmanager

@@ -10,8 +10,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Index
 from impactopt.contact.fields import abouts
 from impactopt.errors import InputError
 from impactopt.planning.parameter_changes import changed, with_term
@@ -36,8 +36,6 @@ from impactopt.solvers.relaxed import Relaxation
 from impactopt.transcription.layout import ConstraintOrigin
 from impactopt.transcription.transcription import Transcription
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 Selector = Callable[[ConstraintOrigin], bool]
 FEASIBLE = 1e-5  # largest violation of the (scaled) constraints that counts as none here
 TYPICAL_DURATION = 1.0  # [s] of a swing or a follow-through

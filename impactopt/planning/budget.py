@@ -11,9 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from types import FrameType
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from impactopt.arrays import Array
 from impactopt.errors import InputError, check_choice, check_positive, shortened
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
@@ -22,7 +20,6 @@ from impactopt.solvers.program import Callback, IterationRecord, NonlinearProgra
 from impactopt.solvers.run import BarrierState, Watch
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
 
-Array = NDArray[np.float64]
 SOLVERS = (*OPTIONS, "ipopt")
 EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 # Violations of the (scaled) constraints above it are listed. An iterate without any is feasible, if not an

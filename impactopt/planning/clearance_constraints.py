@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Mask
 from impactopt.bodies.clearance import DEEPEST, MISSED, SLACK, Bodies, Places
 from impactopt.bodies.robot_bodies import NEIGHBOUR_JOINTS, Pair
 from impactopt.bodies.separation import ROUNDING, Looked, Placed
@@ -36,7 +36,6 @@ from impactopt.transcription.mesh import MoreNodes
 from impactopt.transcription.plan import COARSE_STEP, Plan
 from impactopt.transcription.transcription import Transcription
 
-Array = NDArray[np.float64]
 Constraints = dict[ClearanceKey, SeparatingDirection]
 IN_CONTACT, AFTER_CONTACT = 1, 2  # phases, as of `Places.phase`
 # [m] An iterate with an unconstrained pair nearer than TRIGGER interrupts the solve. Then all pairs nearer
@@ -264,7 +263,7 @@ class Watch:
         return at, self._shapes.look(at, exact_within, directions, self._margins.wanted, before)
 
     # ------------------------------------------------------------------ clearance violations
-    def _bare(self, found: Looked, within: Array | float) -> NDArray[np.bool_]:
+    def _bare(self, found: Looked, within: Array | float) -> Mask:
         """Mask (m,) of the pairs found that are nearer than ``within`` [m], a number or (P,), and have no
         constraint.
         """
@@ -373,13 +372,8 @@ class _Approach(NamedTuple):
     missed: bool
 
 
-def clearance_violations(
-    solution: Evaluation[Transcription], margins: Margins, *, share: float = LOST_BETWEEN_NODES
-) -> ClearanceViolations | None:
-    """Clearance violations of a solution, at its nodes or between them; None if there are none.
-
-    share : part of its margin that a pair loses, by exact geometry, in a violation.
-    """
+def clearance_violations(solution: Evaluation[Transcription], margins: Margins) -> ClearanceViolations | None:
+    """Clearance violations of a solution, at its nodes or between them; None if there are none."""
     t, plan, bodies = solution.program, solution.planned, margins.bodies
     approaches = list[tuple[Pair, _Approach]]()
     # The motion after a missed target exists only with an abort motion.
@@ -391,7 +385,7 @@ def clearance_violations(
         at = Places.of(t.robot, motion.q, phase, motion.displacement)
         approaches += [
             (pair, _Approach(distance, float(motion.time[k]), missed))
-            for k, pair, distance in _near(margins, at, share)
+            for k, pair, distance in _near(margins, at, LOST_BETWEEN_NODES)
         ]
     if not approaches:
         return None

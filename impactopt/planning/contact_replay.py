@@ -15,8 +15,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.collision.interface import CollisionModel
 from impactopt.collision.sdc import frozen_model
 from impactopt.collision.settings import coasting_reference
@@ -33,7 +33,6 @@ from impactopt.transcription.contact_guess import contact_order, fastest_at_cont
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.plan import Plan, PlannedStrike, Trajectory
 
-Array = NDArray[np.float64]
 # [%] Largest differences between planned and replayed impulse of a solved, and of an acceptable plan.
 SOLVED_WITHIN, ACCEPTABLE_WITHIN = 1.0, 5.0
 # With these the impulse is within 0.013 % of that with steps of 0.2 ms.

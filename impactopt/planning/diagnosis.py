@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.planning.bounds import (
     FEASIBLE,
@@ -49,7 +49,6 @@ from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.plan import Plan, PlannedCollision
 from impactopt.transcription.transcription import Transcription
 
-Array = NDArray[np.float64]
 # In the search durations may be so many times longer or shorter, or typical.
 _DURATION_FACTOR = 4.0
 _MAX_CONTACT_PHASE = 0.2  # [s] longest duration of a phase of contact in the search

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.refinement import Evaluation, Outcome, Program, carried, program_for
 from impactopt.problem.problem import ImpactProblem
@@ -19,7 +19,6 @@ from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.contact_program import ContactProgram
 
-Array = NDArray[np.float64]
 _BARRIER = 1e-7  # first one of the program with fixed gains, whose initial guess is a solution
 _AT_BOUND = 1e-3  # largest distance of a factor's logarithm from its bound's that counts as at it
 

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Generic
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.planning.parameter_changes import changed
@@ -28,7 +28,6 @@ from impactopt.transcription.mesh import GEAR
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, plan_loads, strike_loads
 from impactopt.transcription.transcription import Transcription
 
-Array = NDArray[np.float64]
 # Tolerances beyond a limit. In replays of a plan that keeps its gear limits, loads stay within the first one
 # (of the limit). The others are what a plan with constraints exceeds between its nodes.
 REPLAY_GEAR_TOLERANCE = 0.1

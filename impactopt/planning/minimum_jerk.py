@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import quintic
@@ -30,8 +30,6 @@ from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.simulation.engines import longest_stable_step
 from impactopt.transcription.initial_guess import strike_rates
 from impactopt.transcription.plan import Completed, Trajectory, complete_reference
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

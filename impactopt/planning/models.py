@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.collision.sdc import frozen_model
 from impactopt.contact.laws import KelvinVoigt
 from impactopt.contact.targets.base import is_order
@@ -34,7 +34,6 @@ from impactopt.transcription.contact_guess import contact_order, fastest_at_cont
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.initial_guess import strike_rates
 
-Array = NDArray[np.float64]
 AnySolution = TypeVar("AnySolution", bound=Solved)
 # Models that "auto" tries. Not the SDC with more freezes: in a program a freeze during contact costs as much
 # as full dynamics.

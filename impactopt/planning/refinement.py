@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.planning.budget import VIOLATED, Budget, one_after_the_other, rank_of, with_effort_of
 from impactopt.planning.contact_replay import ContactReplay, PlannedContact, checked, model_error
 from impactopt.problem.problem import ImpactProblem
@@ -27,7 +27,6 @@ from impactopt.transcription.mesh import Elements, MoreNodes, Shares
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 
-Array = NDArray[np.float64]
 Program = TypeVar("Program", Transcription, StrikeTranscription)
 MAX_VIOLATIONS = 20  # that an outcome lists
 

@@ -14,8 +14,8 @@ from typing import Any, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError, check_choice, check_kind
 from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.clearance_constraints import Margins, same_bodies
@@ -183,7 +183,6 @@ def parametric_program(solution: Solution) -> ParametricProgram:
     return _known[solution]
 
 
-Array = NDArray[np.float64]
 # Half of a central difference, over the parameter's size. The least durations of a contact's phases come from
 # the impact of a point mass, integrated with a relative error of 1e-6, which dominates with a smaller step.
 _DIFFERENCE_STEP = 1e-2

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid, trapezoid
 
 from impactopt import __version__
+from impactopt.arrays import Array
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, counted
 from impactopt.planning.bounds import Cause
@@ -41,6 +41,7 @@ from impactopt.planning.refinement import Attempt, Outcome
 from impactopt.problem.feasibility import overlapping
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads, weight_of
+from impactopt.simulation.collision_geometry import UnintendedContact
 from impactopt.simulation.result import check_simulations
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_refinement import ContactError, finest
@@ -48,7 +49,6 @@ from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares, c
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, Trajectory, motion_loads
 from impactopt.transcription.transcription import Transcription, block_functions
 
-Array = NDArray[np.float64]
 REVERSAL = 0.02  # [rad] by which a joint has to move back to count as a reversal
 TOUCH_WINDOW, TOUCH_STEP = 0.05, 2.5e-4  # [s] time before contact that is searched for a touch, and step
 
@@ -369,11 +369,8 @@ class Solution(Solved):
             found = bodies.survey(motion.time, at)
             if found.clearance < least:
                 least, nearest = found.clearance, " and ".join(found.nearest)
-            for one, other, start, end, depth in found.touches:
-                touches.append(
-                    {"one": one, "other": other, "start_s": start, "end_s": end, "depth_mm": 1e3 * depth}
-                    | ({"missed": True} if missed else {})
-                )
+            contacts = (UnintendedContact(**touch._asdict()).summary() for touch in found.touches)
+            touches += [contact | ({"missed": True} if missed else {}) for contact in contacts]
         return least, nearest, touches
 
     @cached_property

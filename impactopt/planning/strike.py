@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from impactopt.errors import InputError, check_array
 from impactopt.planning.budget import Budget, touching
@@ -34,7 +33,6 @@ from impactopt.transcription.plan import PlannedStrike
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
-Array = NDArray[np.float64]
 BARRIER_WARM = 1e-2  # first barrier of a warm start with other constraints
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 

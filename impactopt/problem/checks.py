@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.world import Ground, Obstacle, TargetBody
 from impactopt.contact.friction import check_friction, moves_target
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
@@ -72,9 +72,7 @@ def check_apart(kind: str, names: Sequence[str]) -> None:
         raise InputError(f"two {kind}s are called {twice!r}: give each a name of its own")
 
 
-def check_at_rest(
-    robot: Robot, coordinates: StanceCoordinates, soles: Sequence[str], posture: NDArray[np.float64]
-) -> None:
+def check_at_rest(robot: Robot, coordinates: StanceCoordinates, soles: Sequence[str], posture: Array) -> None:
     """InputError if the posture's centre of mass is not above the fixed soles, so that the robot falls."""
     polygon = support_polygon(robot, coordinates)
     if not len(polygon):

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from impactopt.arrays import Array
 from impactopt.bodies.clearance import Places, Touch
 from impactopt.contact.targets import Nail
 from impactopt.errors import InputError, counted
@@ -30,7 +30,6 @@ from impactopt.problem.terms import (
 from impactopt.problem.terms.first_touch import face_of
 from impactopt.robots.loads import weight_of
 
-Array = NDArray[np.float64]
 # [m] Distance outside the support polygon to which a motion may take the centre of mass for a short time.
 MAX_LEAN = 0.05
 AHEAD = 2e-3  # [m] that a link may stick out beyond its striking point without a warning

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Mask
 from impactopt.robots.robot import Robot
 
 
@@ -47,7 +47,7 @@ def joints_to(robot: Robot, frames: Iterable[str]) -> set[int]:
     return {int(j) for joint in joints for j in model.supports[joint]}
 
 
-def idle_joints(robot: Robot, frames: Iterable[str]) -> NDArray[np.bool_]:
+def idle_joints(robot: Robot, frames: Iterable[str]) -> Mask:
     """Mask (n,) of the joints that move none of these frames, such as those of an idle arm or the head."""
     model = robot.model
     first = model.nv - robot.n

@@ -14,8 +14,8 @@ from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.contact.fields import Described, about
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets.base import Target
@@ -279,7 +279,7 @@ def effort(n: int) -> BlockExpression:
     return make_block([torque, T], [], {"effort": T * ca.sumsqr(torque)})
 
 
-def trapezoid(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+def trapezoid(nodes: Array) -> Array:
     """Weights (k,) of the trapezoidal rule on ascending nodes (k,)."""
     half = np.diff(nodes) / 2
     return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])

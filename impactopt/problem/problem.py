@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Mask
 from impactopt.bodies.clearance import Bodies
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.world import (
@@ -57,7 +57,6 @@ from impactopt.robots.attachments import Sole
 from impactopt.robots.gains import GainFactor
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 __all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
 
 AnyTerm = TypeVar("AnyTerm", bound=Term)
@@ -276,7 +275,7 @@ class ImpactProblem:
         return STYLES[self.style].scaled(self.price_scale)
 
     @cached_property
-    def idle_joints(self) -> NDArray[np.bool_]:
+    def idle_joints(self) -> Mask:
         """Mask (n,) of the joints that move no striker, no sole on the ground and no supporting hand."""
         strikers = [self.robot.striker(name).model_frame for name in self.strikers]
         fixed = [*(leg.frame for leg in self.coordinates.legs), *(sole.frame for sole in self.soles)]
@@ -400,7 +399,7 @@ class ImpactProblem:
         return more.join(y, legs)
 
     @property
-    def standing(self) -> NDArray[np.bool_]:
+    def standing(self) -> Mask:
         """Mask (phases, soles) of the `soles` that stand in each stance phase."""
         names = [sole.name for sole in self.soles]
         stand = [[name in stance.soles for name in names] for stance in self.stances]

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from impactopt.contact.fields import Described, about, abouts
+from impactopt.arrays import Array
+from impactopt.contact.fields import Described, about, abouts, described
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.contact.targets.base import scaled_numbers
@@ -24,8 +24,6 @@ from impactopt.errors import (
 )
 from impactopt.problem.objectives import PeakForce, Penetration
 from impactopt.problem.terms import HitCone, HitRegion, Slide
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -149,39 +147,18 @@ class Scenario(Described):
     """
 
     name: str = field(metadata=about("what reports call it"))
-    mass: float = field(default=1.0, metadata=about("target's mass over the expected mass", above=0))
-    stiffness: float = field(default=1.0, metadata=about("contact stiffness over the expected one", above=0))
-    damping: float = field(default=1.0, metadata=about("contact damping over the expected one", least=0))
-    missing: bool = field(default=False, metadata=about("true: there is nothing to hit"))
-    abort_after: float | None = field(
-        default=None,
-        metadata=about(
-            "time from the planned contact to the abort motion",
-            unit="s",
-            above=0,
-            most=LONGEST_WAIT,
-        ),
+    mass: float = described(1.0, "target's mass over the expected mass", above=0)
+    stiffness: float = described(1.0, "contact stiffness over the expected one", above=0)
+    damping: float = described(1.0, "contact damping over the expected one", least=0)
+    missing: bool = described(False, "true: there is nothing to hit")
+    abort_after: float | None = described(
+        None, "time from the planned contact to the abort motion", unit="s", above=0, most=LONGEST_WAIT
     )
-    torque: float = field(
-        default=1.0,
-        metadata=about("share of each torque limit in the collision", above=0),
+    torque: float = described(1.0, "share of each torque limit in the collision", above=0)
+    cone_margin: float = described(
+        0.005, "margin of each sole's centre of pressure in the collision", unit="m", least=0
     )
-    cone_margin: float = field(
-        default=0.005,
-        metadata=about(
-            "margin of each sole's centre of pressure in the collision",
-            unit="m",
-            least=0,
-        ),
-    )
-    capture_margin: float = field(
-        default=0.0,
-        metadata=about(
-            "margin of the capture point after contact",
-            unit="m",
-            least=0,
-        ),
-    )
+    capture_margin: float = described(0.0, "margin of the capture point after contact", unit="m", least=0)
 
     def __post_init__(self) -> None:
         check_name("a scenario", self.name)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError, check_array, shortened
 from impactopt.kinematics.coordinates import LegClosure, StanceCoordinates
 from impactopt.kinematics.stance import BothSoles, OneSole, Stance, corners_at, overlap
@@ -140,21 +140,19 @@ def _check_steps(stances: Sequence[StancePhase]) -> None:
                 )
 
 
-def places_of_soles(
-    stances: Sequence[StancePhase], names: Sequence[str]
-) -> Iterator[dict[str, NDArray[np.float64]]]:
+def places_of_soles(stances: Sequence[StancePhase], names: Sequence[str]) -> Iterator[dict[str, Array]]:
     """Displacements (2,) [m] of each phase's soles from where they stood at the start, by name.
 
     names : of all soles, in the order of the result.
     """
-    moved: dict[str, NDArray[np.float64]] = {}
+    moved: dict[str, Array] = {}
     for stance in stances:
         moved |= {name: moved.get(name, np.zeros(2)) + step for name, step in stance.steps.items()}
         yield {name: moved.get(name, np.zeros(2)) for name in names if name in stance.soles}
 
 
 def phase_coordinates(
-    robot: Robot, stances: Sequence[StancePhase], start: NDArray[np.float64]
+    robot: Robot, stances: Sequence[StancePhase], start: Array
 ) -> tuple[StanceCoordinates, ...]:
     """Independent coordinates of each stance phase.
 
@@ -181,7 +179,7 @@ def phase_coordinates(
     return tuple(out)
 
 
-def _stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+def _stepped_posture(c: StanceCoordinates, moved: Mapping[str, Array]) -> Array:
     """Posture (nq,) of a stance with its soles displaced by ``moved`` (2,) [m].
 
     The base is displaced by the mean of the soles, and lowered if the legs do not reach.

@@ -9,8 +9,8 @@ from itertools import combinations
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.clearance import Places
 from impactopt.bodies.robot_bodies import striker_face
 from impactopt.contact.laws import ContactLaw
@@ -23,7 +23,6 @@ from impactopt.problem.terms.first_touch import face_of
 from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 MAX_SWING = 1.2  # [rad], [m] travel of a joint from rest to contact
 LIMIT_MARGIN = 0.05  # of a joint's range, between a posture at contact and the joint's limits
 # postures with estimated impacts, and postures that are drawn for them at most, as most may not face a normal

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.files.record import Record, replay_name
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.histories import (
@@ -24,7 +25,6 @@ from impactopt.report.histories import (
 from impactopt.report.tracks import planned_hand_speed
 from impactopt.simulation.result import centre_of_pressure
 
-Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
 NEAR = (0.01, 0.03)  # [s] before and after contact, shown of the force at first
 # label, prefix in a record, style; the styles are those of style.css

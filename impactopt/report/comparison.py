@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.files.output import is_usable
 from impactopt.files.record import Record, plain
@@ -18,7 +18,6 @@ from impactopt.report.histories import contact_force, ground_wrenches, planned_t
 from impactopt.report.page import Page, html_table, report_html
 from impactopt.report.result_rows import Cell, Row, contact_rows, number_row, phase_rows, standing, word_row
 
-Array = NDArray[np.float64]
 MOST = 5  # results: the page has as many line styles
 STYLES = ("planned", "simulated", "free", "one", "two")
 NOT_SET = "-"

@@ -7,13 +7,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Mask
 from impactopt.files.record import Record
 from impactopt.kinematics.stance import convex_polygon, margin
 from impactopt.simulation.result import centre_of_pressure
 
-Array = NDArray[np.float64]
 BUCKETS = 400  # of a thinned history
 
 
@@ -82,7 +81,7 @@ def _spliced(record: Record, outside: Array, hit: Array, inside: Array) -> tuple
     return time[order], np.concatenate([outside, inside])[order]
 
 
-def soles_standing(record: Record, time: Array) -> dict[str, NDArray[np.bool_]]:
+def soles_standing(record: Record, time: Array) -> dict[str, Mask]:
     """Mask (k,) of the times [s] at which each sole is planned to stand, by name; empty with one stance."""
     phases = record.summary.get("stances") or []
     names = [name.removeprefix("sole_") for name in record.arrays if name.startswith("sole_")]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.files.record import replay_name
 from impactopt.robots.loads import SHARE, margin_between_nodes
 from impactopt.solvers.program import MINOR
@@ -247,7 +247,7 @@ def number_row(
     digits: int,
     *,
     scale: float = 1.0,
-    least: float | NDArray[np.float64] = -np.inf,
+    least: float | Array = -np.inf,
     most: float = np.inf,
     small: bool = False,
 ) -> Row | None:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.robot_bodies import RobotBodies, bodies_of
 from impactopt.bodies.solids import Solid
 from impactopt.bodies.world import WorldBody
@@ -20,8 +20,6 @@ from impactopt.report.result_rows import Cell, Row
 from impactopt.report.stage import Arrays, middle, pack_robot, pack_solid, pack_track, pack_world
 from impactopt.report.tracks import Track, places_of
 from impactopt.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 def bodies_page(robot: Robot) -> Page:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.solids import Solid, simplified
 from impactopt.bodies.visuals import Visual, joined_visuals, surroundings_of
 from impactopt.bodies.world import WorldBody
@@ -17,7 +18,6 @@ from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
 from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
 MAX_TRIANGLES = 120_000  # of a robot
 MIN_CELL = 0.004  # [m] of simplified solids

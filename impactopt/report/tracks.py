@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
+from impactopt.arrays import Array, Index
 from impactopt.files.record import Record, replay_name
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
@@ -18,7 +18,6 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.result import centre_of_pressure, travelled
 from impactopt.transcription.plan import Trajectory, pushed_aside
 
-Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
 FRAME, FINE = 1 / 30, 1 / 500  # [s] between instants, and around contact
 AFTER = 1.0  # [s] shown beyond the end of the planned motion
@@ -158,7 +157,7 @@ def places_of(robot: Robot, frame: str, postures: Array) -> tuple[Array, Array, 
     return np.array(places), np.array(hand), np.array(mass)
 
 
-def _instants(time: Array, start: float, end: float, last: float) -> NDArray[np.intp]:
+def _instants(time: Array, start: float, end: float, last: float) -> Index:
     """Indices of the shown instants: dense around contact, until `last` [s]."""
     last = min(last, float(time[-1]))
     grid = np.arange(0.0, last + FRAME / 2, FRAME)
@@ -171,7 +170,7 @@ def _instants(time: Array, start: float, end: float, last: float) -> NDArray[np.
     return np.unique(np.concatenate([before, at]).clip(0, len(time) - 1))  # both sides of a jump
 
 
-def _planned(model: Any, record: Record, chosen: NDArray[np.intp]) -> Array:
+def _planned(model: Any, record: Record, chosen: Index) -> Array:
     """Configurations (k, nq) of the plan at instants of its reference."""
     a = record.arrays
     time, q, contact = a["reference_time"], a["reference_q"].copy(), np.flatnonzero(a["reference_phase"] == 1)
@@ -186,7 +185,7 @@ def _planned(model: Any, record: Record, chosen: NDArray[np.intp]) -> Array:
     return np.asarray(q[chosen])
 
 
-def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+def _predicted(record: Record, chosen: Index) -> tuple[Array, Array, Array]:
     """Planned ground wrench and force at the chosen instants, and the target's speed at all instants."""
     a = record.arrays
     time, phase, wrench = a["reference_time"], a["reference_phase"], a["reference_ground"][chosen].copy()

@@ -6,17 +6,16 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
+from impactopt.arrays import Array
 from impactopt.collision import Collision, effective_mass
 from impactopt.errors import InputError, check_positive
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import USUAL_POSTURE, Stance, stance_of, support_polygon
 from impactopt.kinematics.stance import margin as margin_in
 from impactopt.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 MIN_NORMAL_FORCE = 50.0  # [N] of the ground; with less the ZMP is a quotient of small numbers
 _MASS_TOLERANCE = 1e-6  # [kg]

@@ -9,10 +9,10 @@ from typing import Any
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-Array = NDArray[np.float64]
+from impactopt.arrays import Array
+
 FLOOR = -1  # in place of a solid's number
 NEAR = 0.05  # [m] between the enclosing balls of two solids in the reference's motion; others are ignored
 SAMPLING = 0.02  # [s] between the instants of the reference that are checked

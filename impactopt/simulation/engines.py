@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, check_array, check_choice, check_kind, check_number, check_whole
 from impactopt.kinematics.stance import support_polygon
@@ -83,7 +83,6 @@ def solids_of(problem: ImpactProblem) -> Solids:
     return Solids(solids=tuple(solids), pairs=tuple(pairs), floor=0.0 if height is None else height)
 
 
-Array = NDArray[np.float64]
 SAMPLING = 1e-3  # [s] between instants at which a replay's clearance may be computed
 # [rad, m] by which a coordinate must have moved since the last computation, as at 0.5 rad/s in `SAMPLING`
 MIN_MOTION = 5e-4
@@ -103,19 +102,11 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation, distance: flo
     survey = bodies.survey(time[chosen], at)
     touched = simulation.touched
     if simulation.fall is None or not problem.keeps_apart:  # the engine had no solids that collide
-        touched = tuple(
-            UnintendedContact(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth)
-            for t in survey.touches
-        )
-    return replace(
-        simulation,
-        clearance=survey.clearance,
-        nearest=survey.nearest,
-        touched=touched,
-    )
+        touched = tuple(UnintendedContact(**touch._asdict()) for touch in survey.touches)
+    return replace(simulation, clearance=survey.clearance, nearest=survey.nearest, touched=touched)
 
 
-def _sampled(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:
+def _sampled(time: Array, q: Array, travel: Array) -> Index:
     """Indices of the first and last instant, and of those at which bodies have moved since the one before."""
     # the first recorded instant in each millisecond, as in contact all steps are recorded
     _, every = np.unique(np.floor(time / SAMPLING), return_index=True)
@@ -162,7 +153,7 @@ def longest_stable_step(
     servo = Servo(robot, reference, kp=world.kp, kd=world.kd)
     body = recursive_body(robot, (), np.zeros(6), scene.strikers, scene.normal)
 
-    def longest(joints: NDArray[np.bool_]) -> float:
+    def longest(joints: Mask) -> float:
         if not joints.any():
             return np.inf
         rates = [0.0]

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.robots.actuators import numbers_of
 from impactopt.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class Servo:

@@ -14,8 +14,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.contact.friction import tangential_mobility, tangential_outcome
 from impactopt.errors import InputError, check_choice, check_positive
 from impactopt.robots.loads import MIN_LOAD_FRACTION, weight_of
@@ -48,7 +48,6 @@ from impactopt.simulation.result import (
 )
 from impactopt.simulation.target_dynamics import Push, TargetContact
 
-Array = NDArray[np.float64]
 AXES = np.arange(3)
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where the body of a broken target goes
 # A robot has fallen beyond these errors of its base: tilt [rad], and loss of height, over the height of the

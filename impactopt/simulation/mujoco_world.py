@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError, missing_package
 from impactopt.robots.model import axis_of, principal_moments
@@ -20,7 +20,6 @@ from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
 from impactopt.simulation.target_dynamics import SlidingPoints
 
-Array = NDArray[np.float64]
 # hardest equality that MuJoCo accepts: impedance, and time constant in steps
 _MAX_IMPEDANCE, _MIN_TIME_CONSTANT = 0.9999, 2.0
 CONTACTS = ("point", "link")  # a striker touches by its striking point, or by the hulls of its link

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Index
 from impactopt.contact.friction import tangential_mobility, tangential_outcome
 from impactopt.robots.robot import Robot
 from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors, Servo
@@ -29,8 +29,6 @@ from impactopt.simulation.result import (
     stance_at,
 )
 from impactopt.simulation.target_dynamics import Push, TargetContact
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ class _World:
         self.robot, self.scene, self.missing, self.followed = robot, scene, missing, reference
         self.model, self.base = robot.model, robot.model.nv - robot.n
         self._soles = [robot.model.getFrameId(frame) for frame in scene.soles]
-        self._bodies: dict[int, tuple[NDArray[np.intp], Body]] = {}
+        self._bodies: dict[int, tuple[Index, Body]] = {}
         self._stance = stance_at(reference, 0.0)
         self.fixed, self.body = self._body_of(self._stance)
         self.servo, self.contact = Servo(robot, reference), TargetContact(scene)
@@ -87,7 +85,7 @@ class _World:
         """Sets the reference that the servo follows from now on."""
         self.servo, self.followed = Servo(self.robot, reference), reference
 
-    def _body_of(self, stance: int) -> tuple[NDArray[np.intp], Body]:
+    def _body_of(self, stance: int) -> tuple[Index, Body]:
         """Indices of the soles and hands that are fixed in a stance phase, and the robot's dynamics then."""
         if stance not in self._bodies:
             scene = self.scene

@@ -12,15 +12,14 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
 from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 from impactopt.simulation.target_dynamics import SlidingPoints
 
-Array = NDArray[np.float64]
 _AXES = pin.LOCAL_WORLD_ALIGNED
 
 

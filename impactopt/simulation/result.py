@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.contact.friction import ContactFriction, moves_target
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
@@ -20,7 +20,6 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import Solids, UnintendedContact
 from impactopt.simulation.motors import MotorCut
 
-Array = NDArray[np.float64]
 FACE = 0.2  # [m] radius of the target's surface about where it may be hit, across the normal
 MAX_GAP = 5e-3  # [s] between touches that belong to one impact
 PHASES = ("swing", "collision", "follow")
@@ -108,7 +107,7 @@ class Scene:
     hands: tuple[str, ...] = ()
     friction: ContactFriction | None = None
     second: tuple[str, Array] | None = None
-    standing: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    standing: Mask = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     polygons: tuple[Array, ...] = ()
     face: float = FACE
 
@@ -121,7 +120,7 @@ class Scene:
         """Support polygon (c, 2) [m] of a stance phase."""
         return self.polygons[stance] if self.polygons else self.polygon
 
-    def standing_soles(self, stance: int) -> NDArray[np.intp]:
+    def standing_soles(self, stance: int) -> Index:
         """Indices of the soles that stand in a stance phase."""
         return np.flatnonzero(self.standing[stance]) if self.standing.size else np.arange(len(self.soles))
 
@@ -226,8 +225,8 @@ class Simulation:
     cuts: tuple[MotorCut, ...] | None = None
     grip_force: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     impulses: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    stance: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
-    stands: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool), repr=False)
+    stance: Index = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
+    stands: Mask = field(default_factory=lambda: np.zeros((0, 0), dtype=bool), repr=False)
     polygons: tuple[Array, ...] = field(default=(), repr=False)
     landing_speed: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     target_aside: Array = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
@@ -271,7 +270,7 @@ class Simulation:
         """Displacement (k, 3) [m] of the target across its normal; zero if friction does not move it."""
         return self.target_aside if len(self.target_aside) else np.zeros((len(self.time), 3))
 
-    def phase(self) -> NDArray[np.intp]:
+    def phase(self) -> Index:
         """Phase (k,) by the contact that happened: 0 swing, 1 collision, 2 follow-through."""
         start = self.contact_start if np.isfinite(self.contact_start) else np.inf
         end = self.contact_end if np.isfinite(self.contact_end) else np.inf
@@ -584,7 +583,7 @@ def cop_margins(robot: Robot, scene: Scene, q: Array, sole_ground: Array) -> Arr
     return cop_margin(robot, scene.corners, wrenches)
 
 
-def slip_and_lift(scene: Scene, corners: Array, stance: NDArray[np.intp]) -> tuple[Array, Array]:
+def slip_and_lift(scene: Scene, corners: Array, stance: Index) -> tuple[Array, Array]:
     """Slip and lift (k, soles) [m] of the corner of each sole that moved most since the sole began to stand.
 
     corners (k, corners, 3) [m] : positions of all soles' corners, in the scene's order.
@@ -604,9 +603,7 @@ def _corners_of(scene: Scene) -> list[slice]:
     return [slice(a, b) for a, b in itertools.pairwise(np.cumsum([0, *(len(c) for c in scene.corners)]))]
 
 
-def _standing_intervals(
-    scene: Scene, stance: NDArray[np.intp], sole: int, count: int
-) -> list[tuple[int, int]]:
+def _standing_intervals(scene: Scene, stance: Index, sole: int, count: int) -> list[tuple[int, int]]:
     """Index of the first instant, and that after the last, of each interval in which a sole stands.
 
     count : number of instants.
@@ -618,9 +615,7 @@ def _standing_intervals(
     return list(zip(np.flatnonzero(np.diff(on) > 0), np.flatnonzero(np.diff(on) < 0), strict=True))
 
 
-def landing_speeds(
-    scene: Scene, time: Array, corners: Array, sole_ground: Array, stance: NDArray[np.intp]
-) -> Array:
+def landing_speeds(scene: Scene, time: Array, corners: Array, sole_ground: Array, stance: Index) -> Array:
     """Largest speed (soles,) [m/s] of a sole's corners at touchdown; nan without one.
 
     Touchdown is when the sole first carries load, but not in the first half of its planned time in the air.

@@ -11,8 +11,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Mask
 from impactopt.errors import InputError, check_array, check_positive, check_whole, shortened
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
@@ -23,7 +23,6 @@ from impactopt.simulation.mujoco_world import mujoco_module
 from impactopt.simulation.perturbation import MIN_PAYLOAD
 from impactopt.simulation.workers import map_on_workers
 
-Array = NDArray[np.float64]
 Z95 = 1.959964  # 95 % of a normal distribution lie within as many standard deviations
 STEP = 5e-4  # [s]: the same robots stand as with 1e-4, at a fifth of the time
 MAX_SEED = 10**9
@@ -131,7 +130,7 @@ class Robustness:
 
     perturbations: Sequence[Perturbation]
     drawn_from: PerturbationRanges
-    standing: NDArray[np.bool_]
+    standing: Mask
     reason: Sequence[str]
     impulse: Array
     slip: Array

@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from impactopt.arrays import Array
 from impactopt.contact.friction import ContactFriction, deflection_rate, lean
 from impactopt.errors import InputError
 from impactopt.simulation.result import FACE, Scene
 
-Array = NDArray[np.float64]
-State = TypeVar("State")
-Move = Callable[[float], tuple[State, bool]]
 MAX_SWITCHES = 20  # of a target within one step
 BISECTIONS = 30  # of a step, to locate a switch, or a begin or end of contact
 # Tolerances of the contact within a step. The absolute one is in m, N s and units of the target's state.
@@ -205,25 +202,34 @@ class TargetContact:
     def moved(self, state: Array, force: float, length: float) -> Array:
         """State after a time [s] under a constant force, by the classical Runge-Kutta method of order four.
 
+        It is one step without a switch of the target, or several that end just beyond a switch.
+
         Unlike Euler's method, it does not let the oscillation of an unbroken board grow.
         """
         if not any(self.target.derivative(state, force, self._target_parameters)):
             return state  # at rest, as before the impact
 
-        def begin(_done: float, s: Array) -> Move[Array]:
-            before = self.side(s, force)
+        def step(s: Array, h: float) -> tuple[Array, bool]:
+            """State after a step h [s], and True if no state evaluated in it is beyond a switch."""
+            a = self.rates(s, force)
+            b = self.rates(second := s + h / 2 * a, force)
+            c = self.rates(third := s + h / 2 * b, force)
+            d = self.rates(fourth := s + h * c, force)
+            after, before = s + h / 6 * (a + 2 * b + 2 * c + d), self.side(s, force)
+            return after, all(self.side(x, force) == before for x in (second, third, fourth, after))
 
-            def move(h: float) -> tuple[Array, bool]:
-                a = self.rates(s, force)
-                b = self.rates(second := s + h / 2 * a, force)
-                c = self.rates(third := s + h / 2 * b, force)
-                d = self.rates(fourth := s + h * c, force)
-                after = s + h / 6 * (a + 2 * b + 2 * c + d)
-                return after, all(self.side(x, force) == before for x in (second, third, fourth, after))
-
-            return move
-
-        return smooth_steps(begin, state, length)
+        done = 0.0
+        for _ in range(MAX_SWITCHES):
+            low, high = 0.0, length - done
+            after, smooth = step(state, high)
+            if smooth:
+                return after
+            # `step` tells no more than whether a switch is passed, so its length is bisected
+            for _ in range(BISECTIONS):  # `low` is before the switch, `high` beyond it
+                middle = (low + high) / 2
+                low, high = (middle, high) if step(state, middle)[1] else (low, middle)
+            state, done = step(state, high)[0], done + high
+        return step(state, length - done)[0]
 
 
 def _with_both_sides(times: Array, touches: Callable[[float], bool]) -> Array:
@@ -240,27 +246,6 @@ def _with_both_sides(times: Array, touches: Callable[[float], bool]) -> Array:
                 low, high = (middle, high) if touches(middle) == on[k] else (low, middle)
             more += [low, high]
     return np.union1d(times, more)
-
-
-def smooth_steps(begin: Callable[[float, State], Move[State]], state: State, length: float) -> State:
-    """State after `length` [s], in one step without a switch, or in several that end just beyond a switch.
-
-    begin : maps the time passed [s] and the state then to a function of a step's length [s], which returns
-        the state after the step, and True if no state evaluated in the step is beyond a switch.
-    """
-    done = 0.0
-    for _ in range(MAX_SWITCHES):
-        move = begin(done, state)
-        low, high = 0.0, length - done
-        after, smooth = move(high)
-        if smooth:
-            return after
-        # `move` tells no more than whether a switch is passed, so the step's length is bisected
-        for _ in range(BISECTIONS):  # `low` is before the switch, `high` beyond it
-            middle = (low + high) / 2
-            low, high = (middle, high) if move(middle)[1] else (low, middle)
-        state, done = move(high)[0], done + high
-    return begin(done, state)(length - done)[0]
 
 
 class SlidingPoints:

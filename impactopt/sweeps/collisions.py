@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from impactopt.arrays import Array, Index
 from impactopt.collide.contact_states import ContactStates, Posture, States
 from impactopt.collide.single_collision import (
     NOT_ENDED,
@@ -119,8 +120,6 @@ def _in_section(key: str) -> tuple[str, ...]:
     raise InputError(f"{key}: [at_contact] has no such key{near}; known are {', '.join(known)}")
 
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 Numbers = Mapping[Place, Array]  # values (count, ...) of the keys with the role "number" or "point"
 
 # collisions in one call of a compiled batch, without and with histories, which are large
@@ -498,7 +497,7 @@ class Collisions:
                 out[name][indices] = values
         return out
 
-    def _groups(self, columns: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], NDArray[np.intp]]]:
+    def _groups(self, columns: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], Index]]:
         """Combinations of values of the structural keys, each with the indices of its collisions."""
         count = len(next(iter(columns.values()))) if columns else 1
         keys = [key for key, place in self.places.items() if role_of(place) == "structure"]

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt import __version__
+from impactopt.arrays import Array
 from impactopt.files.record import Record
 from impactopt.sweeps.sections import SweepSection
 
-Array = NDArray[np.float64]
 Column = Sequence[Any] | NDArray[Any]
 
 

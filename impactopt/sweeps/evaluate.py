@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from impactopt import __version__
 from impactopt.errors import InputError
 from impactopt.files.output import record_of, record_of_strike, summary_of
-from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.files.problem_file import ProblemFile
 from impactopt.files.record import Record, plain
 from impactopt.files.solution_library import SolvedFolder
 from impactopt.planning.solution import Solution
@@ -68,7 +68,7 @@ Evaluated = tuple[Columns, Mapping[int, Record]]
 def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Evaluated:
     """Columns and record of a solve or a strike, which is a unit by itself."""
     settings = {key: values[0] for key, values in unit.columns.items()}
-    file = problem_file_from_data(work.data, where=work.path).changed(settings)
+    file = ProblemFile.from_data(work.data, work.path).changed(settings)
     problem = file.build()
     options = {
         "starts": work.settings.starts,
@@ -102,7 +102,7 @@ def _collide(work: Work, unit: Unit, watchdog: Watchdog) -> Evaluated:
     """Columns of a unit of collisions."""
     global _kept
     if _kept is None or _kept[0] != work:
-        file = problem_file_from_data(work.data, where=work.path)
+        file = ProblemFile.from_data(work.data, work.path)
         keys, folder = tuple(unit.columns), work.folder
         _kept = work, Collisions(file, work.at_contact, work.settings.outputs, keys=keys, folder=folder)
     columns = _kept[1](unit.columns, threads=1)

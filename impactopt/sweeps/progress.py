@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Mask
 from impactopt.errors import printable
 from impactopt.sweeps.design import Columns
 from impactopt.sweeps.table import START, merge_kinds
@@ -89,7 +89,7 @@ class ProgressCounter:
             if self.best is None or found[at] > self.best:
                 self.best, self.best_case = float(found[at]), first + at
 
-    def _count_iterations(self, columns: Columns, good: NDArray[np.bool_]) -> None:
+    def _count_iterations(self, columns: Columns, good: Mask) -> None:
         for start, iterations, usable in zip(columns[START], columns["iterations"], good, strict=True):
             if usable:
                 name = "neighbour" if start else "reach"

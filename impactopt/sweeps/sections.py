@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from impactopt.files.sections.diagnostics import Mistake
-from impactopt.files.sections.values import Positive, Section, optional, required
+from impactopt.files.sections.values import Positive, Section, optional, required, usual
 
 
 def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -49,27 +49,17 @@ class Figure(Section):
     drawn_as: Literal["heatmap", "lines", "scatter"] = required("what is drawn", "kind")
     x: str = required("column on the horizontal axis")
     y: Names = required("column on the vertical axis; with lines one or several, each in a panel")
-    colour: Names = Field(
-        default_factory=list,
-        description="of heatmaps one or several columns, each in a panel; of lines the columns that "
-        "distinguish them",
+    colour: Names = usual(
+        [], "of heatmaps one or several columns, each in a panel; of lines the columns that distinguish them"
     )
     panel: str | None = optional("of lines and scatters: a panel for each of its values")
-    against: Named = Field(
-        default_factory=dict,
-        description="of lines: by key the value of the reference rows, which the others are compared with in "
-        "per cent",
+    against: Named = usual(
+        {}, "of lines: by key the value of the reference rows, which the others are compared with in per cent"
     )
-    contour: Levels = Field(
-        default_factory=dict, description="of heatmaps: by column the level at which a line is drawn"
-    )
-    log: list[Literal["x", "y", "colour"]] = Field(
-        default_factory=list, description="columns with logarithmic scales"
-    )
-    labels: Texts = Field(
-        default_factory=dict, description="by the name of a column or line, the text in its place"
-    )
-    title: str = Field(default="", description="title above the picture")
+    contour: Levels = usual({}, "of heatmaps: by column the level at which a line is drawn")
+    log: list[Literal["x", "y", "colour"]] = usual([], "columns with logarithmic scales")
+    labels: Texts = usual({}, "by the name of a column or line, the text in its place")
+    title: str = usual("", "title above the picture")
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -123,24 +113,21 @@ class SweepSection(Section):
     """Kind of case, and its problem."""
 
     problem: str = required("a problem's name, or a file beside this one")
-    name: str = Field(default="", description="what reports call the sweep")
-    case_kind: Literal["solve", "strike", "collision"] = Field(
-        default="solve", description="a whole motion, the strike alone, or one collision"
+    name: str = usual("", "what reports call the sweep")
+    case_kind: Literal["solve", "strike", "collision"] = usual(
+        "solve", "a whole motion, the strike alone, or one collision"
     )
-    seed: Seed = Field(default=0, description="seed of what is drawn, and of solves from several starts")
-    start: Literal["reach", "strike", "neighbour"] = Field(
-        default="reach",
-        description="initial guess of a solve: a plain reach, the strike alone, or the nearest case solved "
+    seed: Seed = usual(0, "seed of what is drawn, and of solves from several starts")
+    start: Literal["reach", "strike", "neighbour"] = usual(
+        "reach",
+        "initial guess of a solve: a plain reach, the strike alone, or the nearest case solved "
         "so far (a plain reach if there is none)",
     )
-    starts: AtLeastOne = Field(
-        default=1, description="initial guesses of each solve or strike, of which the best is kept"
-    )
+    starts: AtLeastOne = usual(1, "initial guesses of each solve or strike, of which the best is kept")
     time_limit: Positive = optional("time limit of the solver in each case [s]", "time_limit_s")
-    trajectories: bool = Field(default=False, description="keep the full result of each case")
-    outputs: Annotated[tuple[str, ...], Field(strict=False)] = Field(
-        default=("impulse_Ns", "peak_force_N", "freeze_error_pct"),
-        description="columns of the table, of collisions",
+    trajectories: bool = usual(False, "keep the full result of each case")
+    outputs: Annotated[tuple[str, ...], Field(strict=False)] = usual(
+        ("impulse_Ns", "peak_force_N", "freeze_error_pct"), "columns of the table, of collisions"
     )
 
 
@@ -150,17 +137,13 @@ class SpanSection(Section):
     first: float = required("the first", "from")
     last: float = required("the last, included", "to")
     count: Count | None = optional("number of values; not for drawn ones")
-    scale: Literal["linear", "log"] = Field(
-        default="linear", description="equal steps (linear) or equal factors (log)"
-    )
+    scale: Literal["linear", "log"] = usual("linear", "equal steps (linear) or equal factors (log)")
 
 
 class DrawSection(Section):
     """Points drawn over ranges."""
 
-    method: Literal["random", "sobol", "latin hypercube"] = Field(
-        default="sobol", description="method of drawing"
-    )
+    method: Literal["random", "sobol", "latin hypercube"] = usual("sobol", "method of drawing")
     count: Count = required("number of points")
     over: dict[str, Any] = required("by key path, a range or a list to choose from")
 
@@ -169,14 +152,10 @@ class SweepFile(Section):
     """A sweep file; keys below [set], [grid], [list] and [draw.over] are the problem file's."""
 
     sweep: SweepSection
-    at_contact: dict[str, Any] = Field(default_factory=dict, description="state at contact, of collisions")
-    set: dict[str, Any] = Field(default_factory=dict, description="values that are the same in every case")
-    grid: dict[str, Any] = Field(
-        default_factory=dict, description="values of which every combination is a case"
-    )
-    list: dict[str, Any] = Field(
-        default_factory=dict, description="lists of equal length, whose values at the same index are a case"
-    )
+    at_contact: dict[str, Any] = usual({}, "state at contact, of collisions")
+    set: dict[str, Any] = usual({}, "values that are the same in every case")
+    grid: dict[str, Any] = usual({}, "values of which every combination is a case")
+    list: dict[str, Any] = usual({}, "lists of equal length, whose values at the same index are a case")
     draw: DrawSection = optional("drawn values")
     figure: Figure | None = optional("picture of the table")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -27,7 +28,7 @@ from impactopt import (
     VirtualMass,
 )
 from impactopt.errors import InputError
-from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
+from impactopt.files.problem_file import ProblemFile, load_problem, problem_data
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.stance import FixedBase, Free
 
@@ -229,7 +230,7 @@ def test_derivatives_are_those_of_differences() -> None:
 
 def test_a_file_has_bristles() -> None:
     rough = dataclasses.replace(load_problem("arm_planar"), friction=BENDING)
-    again = problem_from_data(problem_data(rough), where="again.toml")
+    again = ProblemFile.from_data(problem_data(rough), Path("again.toml")).build()
     assert again.friction == BENDING and again.hash == rough.hash
     assert rough.hash != dataclasses.replace(rough, friction=ContactFriction(coefficient=0.6)).hash
 

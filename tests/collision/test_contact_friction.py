@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -34,7 +35,7 @@ from impactopt import (
     load_problem,
     striking_velocity,
 )
-from impactopt.files.problem_file import problem_data, problem_from_data
+from impactopt.files.problem_file import ProblemFile, problem_data
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.simulation import scene_of, simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipm import solve_ipm
@@ -302,8 +303,8 @@ def test_bad_input_and_models_without_friction_are_refused() -> None:
 def test_a_file_has_it_and_other_problems_keep_their_hash() -> None:
     problem = load_problem("arm_planar")
     rough = dataclasses.replace(problem, friction=GENTLE)
-    again = problem_from_data(problem_data(rough), where="again.toml")
+    again = ProblemFile.from_data(problem_data(rough), Path("again.toml")).build()
     assert again.friction == GENTLE and again.hash == rough.hash != problem.hash
     data = {**problem_data(problem), "friction": {"coefficient": 0.4, "slip_speed_m_s": 0.02}}
-    read = problem_from_data(data, where="read.toml")
+    read = ProblemFile.from_data(data, Path("read.toml")).build()
     assert read.friction == ContactFriction(coefficient=0.4, slip_speed=0.02)

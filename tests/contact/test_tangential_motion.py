@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -40,7 +41,7 @@ from impactopt import (
     solve,
     striking_velocity,
 )
-from impactopt.files.problem_file import problem_data, problem_from_data
+from impactopt.files.problem_file import ProblemFile, problem_data
 from impactopt.planning.lazy_constraints import slide
 from impactopt.simulation import scene_of, simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipm import solve_ipm
@@ -357,7 +358,7 @@ def test_a_file_has_it_and_a_target_that_is_held_keeps_its_hash() -> None:
     data = problem_data(moves)
     assert data["friction"] == {"coefficient": 0.6, "moves_target": True}
     assert "moves_target" not in problem_data(held)["friction"]
-    again = problem_from_data(data, where="again.toml")
+    again = ProblemFile.from_data(data, Path("again.toml")).build()
     assert again.friction == moves.friction and again.hash == moves.hash != held.hash
 
 

@@ -36,7 +36,7 @@ from impactopt import (
     problem_names,
     write_problem,
 )
-from impactopt.files.problem_file import SolverSettings, parse_problem_file, read_problem_file, read_toml
+from impactopt.files.problem_file import ProblemFile, SolverSettings, read_problem_file, read_toml
 from impactopt.files.problem_file.reference import problem_template, reference
 from impactopt.files.sections.values import Section
 from impactopt.problem import objectives, terms
@@ -45,7 +45,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def back(text: str, folder: Path = Path()) -> ImpactProblem:
-    return parse_problem_file(text, folder / "written.toml").build()
+    return ProblemFile.parse(text, folder / "written.toml").build()
 
 
 def assert_same(a: ImpactProblem, b: ImpactProblem) -> None:
@@ -75,7 +75,7 @@ def test_every_problem_of_the_package_comes_back(name: str) -> None:
     problem = read.build()
     text = write_problem(problem, solver=read.solver)
     assert_same(back(text), problem)
-    again = parse_problem_file(text, Path("written.toml"))
+    again = ProblemFile.parse(text, Path("written.toml"))
     assert again.solver == read.solver
     # nothing stands there that could be left out
     data = read_toml(text)
@@ -415,7 +415,7 @@ def test_solver_settings_are_written(nailing: ImpactProblem) -> None:
     solver = SolverSettings(
         name="ipopt", time_limit=3.5, options={"ipopt": {"tol": 1e-5}, "sqp": {"radius": 2.0}}
     )
-    assert parse_problem_file(write_problem(nailing, solver=solver), Path("x.toml")).solver == solver
+    assert ProblemFile.parse(write_problem(nailing, solver=solver), Path("x.toml")).solver == solver
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ from impactopt.cli.app import app
 from impactopt.contact.fields import about
 from impactopt.contact.laws import LAWS
 from impactopt.files.named_problems import problem_file
-from impactopt.files.problem_file import problem_data, problem_from_data, read_toml
+from impactopt.files.problem_file import ProblemFile, problem_data, read_toml
 from impactopt.identification.fitting import TwoMassModel
 from impactopt.identification.free_parameters import sample_law
 from impactopt.identification.log import find_impacts
@@ -500,7 +500,7 @@ def test_the_command_prints_numbers_and_writes_a_section(tmp_path: Path) -> None
     assert section["law"] == "Hunt-Crossley"
     assert section["dissipation_s_m"] == pytest.approx(best["dissipation"]["value"], rel=1e-4)
     data = {**problem_data(load_problem("arm_planar")), "contact": section}
-    law = problem_from_data(data, where=tmp_path / "problem.toml").law
+    law = ProblemFile.from_data(data, tmp_path / "problem.toml").build().law
     assert isinstance(law, HuntCrossley)
     assert law.stiffness == pytest.approx(best["stiffness"]["value"], rel=1e-4)
     shown = CliRunner().invoke(app, words[:4])  # without the other law

@@ -28,7 +28,7 @@ from impactopt import (
     write_problem,
 )
 from impactopt.files.output import record_of, save_record
-from impactopt.files.problem_file import parse_problem_file
+from impactopt.files.problem_file import ProblemFile
 from impactopt.files.replay import problem_of, resumed
 from impactopt.files.verify import verify
 from impactopt.planning.gain_selection import with_room_for_gains
@@ -153,7 +153,7 @@ def test_what_comes_after_has_the_gains_that_are_chosen(chosen: Solution) -> Non
 @pytest.mark.slow
 def test_a_file_leaves_gains_open_and_its_result_says_which(tmp_path: Path) -> None:
     text = write_problem(replace(_soft(), gains=_open(HAND)))
-    read = parse_problem_file(text, tmp_path / "soft.toml")
+    read = ProblemFile.parse(text, tmp_path / "soft.toml")
     problem = read.build()
     assert problem.gains == _open(HAND)
     solution = solve(problem, refine=False)
@@ -297,4 +297,4 @@ def test_a_factor_leaves_a_choice(factor: tuple[float, float]) -> None:
 def test_a_file_with_a_factor_that_is_none_is_refused(tmp_path: Path, factor: str, words: str) -> None:
     text = write_problem(replace(_soft(), gains=_open(HAND))).replace("[0.1, 10.0]", factor)
     with pytest.raises(InputError, match=words):
-        parse_problem_file(text, tmp_path / "soft.toml").build()
+        ProblemFile.parse(text, tmp_path / "soft.toml").build()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -27,7 +28,7 @@ from impactopt import (
     load_problem,
 )
 from impactopt.files.export.motion import motion_at
-from impactopt.files.problem_file import problem_data, problem_from_data
+from impactopt.files.problem_file import ProblemFile, problem_data
 from impactopt.files.record import Record
 from impactopt.files.verify import motion_of_record
 from impactopt.planning.bounds import bounds_of
@@ -431,7 +432,7 @@ def test_an_export_says_which_sole_stands(plan: Plan, ways: tuple[Trajectory, Tr
 def test_a_problem_file_has_the_phases() -> None:
     for name in ("punch_step", "kick_talos"):
         problem = load_problem(name)
-        again = problem_from_data(problem_data(problem), where="again.toml")
+        again = ProblemFile.from_data(problem_data(problem), Path("again.toml")).build()
         assert again.hash == problem.hash and again.stances == problem.stances
     data = problem_data(problem)
     for stances, message in (
@@ -441,9 +442,9 @@ def test_a_problem_file_has_the_phases() -> None:
         ([*data["stances"], {"soles": ["up"], "duration_s": 1.0}], "no sole 'up'"),
     ):
         with pytest.raises(InputError, match=message):
-            problem_from_data({**data, "stances": stances}, where="wrong.toml")
+            ProblemFile.from_data({**data, "stances": stances}, Path("wrong.toml")).build()
     with pytest.raises(InputError, match=r"\[stance\] is one stance"):
-        problem_from_data({**data, "stance": {"soles": "left"}}, where="both.toml")
+        ProblemFile.from_data({**data, "stance": {"soles": "left"}}, Path("both.toml")).build()
 
 
 def test_a_page_draws_the_margin_to_what_stands(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> None:

@@ -25,7 +25,7 @@ from impactopt import (
     write_problem,
 )
 from impactopt.codegen.compiler import find_compiler
-from impactopt.files.problem_file import parse_problem_file
+from impactopt.files.problem_file import ProblemFile
 from impactopt.kinematics.operational_space import static_wrenches
 
 HAND = "striker:left_hand"
@@ -158,7 +158,7 @@ def test_it_is_true_in_both_engines(solution: Solution, engine: str) -> None:
 
 def test_a_file_says_which_hands_hold_on(problem: ImpactProblem) -> None:
     assert problem.describe()["holds_on_with"] == ["left_hand"]
-    again = parse_problem_file(write_problem(problem), Path("problem.toml")).build()
+    again = ProblemFile.parse(write_problem(problem), Path("problem.toml")).build()
     assert again.hash == problem.hash and again.stance.hand_frames(again.robot) == (HAND,)
     start = load_robot("standin").posture("on_left_foot")
     stance = OneSole("left", hands=("left_hand",))

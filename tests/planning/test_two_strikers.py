@@ -29,7 +29,7 @@ from impactopt import (
     write_problem,
 )
 from impactopt.codegen.compiler import find_compiler
-from impactopt.files.problem_file import parse_problem_file
+from impactopt.files.problem_file import ProblemFile
 from impactopt.planning.parameter_changes import moved_problem
 from impactopt.simulation.result import Scene
 from impactopt.simulation.target_dynamics import TargetContact
@@ -257,7 +257,7 @@ def test_two_alike_are_one_on_half_the_target() -> None:
 
 
 def test_a_file_has_the_second_striker(problem: ImpactProblem) -> None:
-    again = parse_problem_file(write_problem(problem), Path("problem.toml")).build()
+    again = ProblemFile.parse(write_problem(problem), Path("problem.toml")).build()
     assert again.hash == problem.hash and again.strikers == ("right_hand", "left_hand")
     assert replace(problem, second=None).hash != problem.hash
     assert problem.describe()["second"]["striker"] == "left_hand"

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from impactopt import CustomLaw, FreeMass, ImpactProblem, InputError, Phase, Striker, load_problem
 from impactopt.files.problem_file import (
+    ProblemFile,
     change_data,
     key_place,
     parse_settings,
-    problem_from_data,
     read_problem_file,
     read_toml,
     write_toml,
@@ -43,7 +43,7 @@ DATA: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def problem() -> ImpactProblem:
-    return problem_from_data(DATA, where="arm.toml")
+    return ProblemFile.from_data(DATA, Path("arm.toml")).build()
 
 
 def message(settings: dict[str, Any]) -> str:
@@ -141,7 +141,7 @@ def test_a_value_that_is_wrong_is_told_as_in_a_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"arm.toml: target.mas: .*did you mean"):
         read_problem_file(path, {"target.mas": 1})
     with pytest.raises(InputError, match=r"case 7, \[target\] mass_kg|case 7: \[target\] mass_kg"):
-        problem_from_data(change_data(DATA, {"target.mass": 0}), where="case 7")
+        ProblemFile.from_data(change_data(DATA, {"target.mass": 0}), Path("case 7")).build()
 
 
 def test_a_changed_files_text_says_what_is_solved(tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_the_hash_is_of_the_content(problem: ImpactProblem) -> None:
         changed(terms=terms.DEFAULT_TERMS[::-1]),
         changed(objectives=(objectives.Impulse(weight=1),)),
         changed(start=problem.start_posture, point=tuple(problem.point)),
-        problem_from_data(read_toml(write_toml(DATA)), where="elsewhere").hash,
+        ProblemFile.from_data(read_toml(write_toml(DATA)), Path("elsewhere")).build().hash,
     ]
     assert set(same) == {problem.hash} and problem.hash == problem_hash(problem)
     hammer = problem.robot.striker("hammer")
@@ -221,8 +221,9 @@ def test_the_hash_is_of_the_content(problem: ImpactProblem) -> None:
 @pytest.mark.slow
 def test_the_hash_is_the_same_in_another_process(problem: ImpactProblem) -> None:
     code = (
-        "from impactopt.files.problem_file import problem_from_data\n"
-        f"print(problem_from_data({DATA!r}, where='arm.toml').hash)"
+        "from pathlib import Path\n"
+        "from impactopt.files.problem_file import ProblemFile\n"
+        f"print(ProblemFile.from_data({DATA!r}, Path('arm.toml')).build().hash)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == problem.hash
@@ -259,7 +260,7 @@ def test_every_field_of_a_problem_counts_in_its_hash(problem: ImpactProblem) -> 
 def test_a_file_loads_no_library_and_writes_no_file(tmp_path: Path, option: str, value: Any) -> None:
     given = value.format(folder=tmp_path) if isinstance(value, str) else value
     with pytest.raises(InputError, match=rf"\[solver\] ipopt: {option}"):
-        problem_from_data({**DATA, "solver": {"ipopt": {option: given}}}, where="arm.toml")
+        ProblemFile.from_data({**DATA, "solver": {"ipopt": {option: given}}}, Path("arm.toml")).build()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -269,7 +270,7 @@ def test_an_options_file_in_the_working_directory_is_not_read(
     planted = tmp_path / "ipopt.opt"
     planted.write_text("output_file written.txt\nfile_print_level 5\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    problem_from_data({**DATA, "solver": {"ipopt": {"tol": 1e-5}}}, where="arm.toml")
+    ProblemFile.from_data({**DATA, "solver": {"ipopt": {"tol": 1e-5}}}, Path("arm.toml")).build()
     assert list(tmp_path.iterdir()) == [planted]
 
 
@@ -279,7 +280,7 @@ def test_an_options_file_in_the_working_directory_is_not_read(
 def test_text_stays_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.chdir(tmp_path)
     data = change_data(DATA, {"problem.name": text})
-    assert problem_from_data(read_toml(write_toml(data)), where="x.toml").name == text
+    assert ProblemFile.from_data(read_toml(write_toml(data)), Path("x.toml")).build().name == text
     assert list(tmp_path.iterdir()) == []
 
 
@@ -288,7 +289,7 @@ def test_what_python_can_say_a_file_can_too(problem: ImpactProblem) -> None:
     balance = {"capture_margin": "anywhere", "vertical_speed": float("inf"), "angular_momentum": float("inf")}
     data = change_data(DATA, {f"terms.balance.{key}": value for key, value in balance.items()})
     data = change_data(data, {"terms.incidence.speed": float("inf"), "problem.start": problem.start_posture})
-    made = problem_from_data(data, where="x.toml")
+    made = ProblemFile.from_data(data, Path("x.toml")).build()
     free = terms.Balance(capture_margin=None, vertical_speed=np.inf, angular_momentum=np.inf)
     assert made.term(terms.Balance) == free
     assert made.term(terms.Incidence) == terms.Incidence(speed=np.inf)
@@ -301,7 +302,7 @@ def test_what_python_can_say_a_file_can_too(problem: ImpactProblem) -> None:
         ("robot.position_limit.elbow", [1.0, float("nan")], "must not exceed"),
     ):
         with pytest.raises(InputError, match=said):
-            problem_from_data(change_data(DATA, {key: value}), where="x.toml")
+            ProblemFile.from_data(change_data(DATA, {key: value}), Path("x.toml")).build()
 
 
 def test_all_that_is_wrong_with_a_problem_is_said_at_once(problem: ImpactProblem) -> None:
@@ -344,7 +345,7 @@ def test_names_in_terms_are_told_beside_other_names() -> None:
     data = change_data(DATA, {"problem.striker": "hamer", "problem.start": "redy"})
     data = change_data(data, {"terms.gaze": {"frame": "elbw", "axis": [1.0, 0.0, 0.0]}})
     with pytest.raises(InputError) as caught:
-        problem_from_data(data, where="arm.toml")
+        ProblemFile.from_data(data, Path("arm.toml")).build()
     text = str(caught.value)
     assert "3 mistakes" in text and "[terms.gaze]" in text
     assert all(meant in text for meant in ("'hammer'", "'ready'", "'elbow'"))

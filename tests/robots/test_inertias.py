@@ -10,7 +10,7 @@ import pytest
 from support import urdfs
 
 from impactopt import InputError, Robot
-from impactopt.files.problem_file import problem_file_from_data
+from impactopt.files.problem_file import ProblemFile
 from impactopt.robots.checks import check_inertias, repair_inertias
 
 LOST = 'ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"'
@@ -163,4 +163,4 @@ def test_a_preset_has_nothing_to_repair() -> None:
         "contact": {"stiffness_N_m": 1e4, "damping_N_s_m": 10.0},
     }
     with pytest.raises(InputError, match="inertias belongs to mjcf or urdf"):
-        problem_file_from_data(data, where="p.toml")
+        ProblemFile.from_data(data, Path("p.toml"))

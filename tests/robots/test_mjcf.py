@@ -17,7 +17,7 @@ from support import urdfs
 
 from impactopt import FreeMass, ImpactProblem, InputError, Robot, Sole, SpringDamper, Striker
 from impactopt.bodies.robot_bodies import bodies_of
-from impactopt.files.problem_file import problem_from_data
+from impactopt.files.problem_file import ProblemFile
 from impactopt.robots.mjcf import compile_mjcf, read_mjcf
 from impactopt.simulation.mujoco_world import robot_bodies
 
@@ -504,13 +504,13 @@ def test_a_problem_file_can_name_an_mjcf(tree: Path) -> None:
         "contact": {"stiffness_N_m": 1e4, "damping_N_s_m": 100.0},
     }
     with pytest.raises(InputError, match="out of reach"):
-        problem_from_data(
-            {**data, "problem": {**data["problem"], "point_m": [9.0, 0.0, 0.0]}}, where=tree.parent / "p"
-        )
+        ProblemFile.from_data(
+            {**data, "problem": {**data["problem"], "point_m": [9.0, 0.0, 0.0]}}, tree.parent / "p"
+        ).build()
     with pytest.raises(InputError, match="one of preset, urdf and mjcf"):
-        problem_from_data({**data, "robot": {**data["robot"], "urdf": "x"}}, where=tree.parent / "p")
+        ProblemFile.from_data({**data, "robot": {**data["robot"], "urdf": "x"}}, tree.parent / "p").build()
     with pytest.raises(InputError, match="srdf belongs to urdf"):
-        problem_from_data({**data, "robot": {**data["robot"], "srdf": "x"}}, where=tree.parent / "p")
+        ProblemFile.from_data({**data, "robot": {**data["robot"], "srdf": "x"}}, tree.parent / "p").build()
 
 
 def test_a_mesh_with_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ PACKAGE = Path(impactopt.__file__).parent
 # Each room may import from those above it.
 ROOMS_IN_ORDER = (
     "__init__",
+    "arrays",
     "errors",
     "codegen",
     "contact",
@@ -56,7 +57,7 @@ NUMERIC = (
     "transcription/plan.py",
 )
 # What an engine may know of this package, so that it can contradict the rest of it.
-ENGINE = {"contact", "errors", "robots", "simulation"}
+ENGINE = {"arrays", "contact", "errors", "robots", "simulation"}
 
 
 def own_name(name: str) -> str:

@@ -34,7 +34,7 @@ from impactopt import (
 from impactopt.collide.contact_states import ContactStates, Posture
 from impactopt.collide.single_collision import collide_once, meets_again
 from impactopt.files.output import save_record
-from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.files.problem_file import ProblemFile
 from impactopt.files.sections.reading import CollisionFile
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import Stance, margin
@@ -54,7 +54,7 @@ def arm_file(**problem: Any) -> ProblemFile:
         "target": {"mass_kg": 0.5},
         "contact": {"stiffness_N_m": 2e4, "damping_N_s_m": 50.0},
     }
-    return problem_file_from_data(data, where="arm.toml")
+    return ProblemFile.from_data(data, Path("arm.toml"))
 
 
 def standin_file() -> ProblemFile:
@@ -68,7 +68,7 @@ def standin_file() -> ProblemFile:
         "target": {"mass_kg": 5.0},
         "contact": {"stiffness_N_m": 1e4, "damping_N_s_m": 300.0},
     }
-    return problem_file_from_data(data, where="standin.toml")
+    return ProblemFile.from_data(data, Path("standin.toml"))
 
 
 def drawn(count: int, **ranges: tuple[float, float]) -> dict[str, Any]:
@@ -161,7 +161,7 @@ def test_loads_of_the_ground_in_a_contact_of_less_than_a_millisecond() -> None:
     for name in outputs:
         assert found[name] == pytest.approx(full[name], rel=0.01, abs=1e-3 if name == "zmp_margin_m" else 2.0)
     section = {**standin_file().data["contact"], "stiffness_N_m": 1e8}
-    stiff = problem_file_from_data({**standin_file().data, "contact": section}, where="stiff.toml")
+    stiff = ProblemFile.from_data({**standin_file().data, "contact": section}, Path("stiff.toml"))
     once = collide_once(stiff, {**given, "speed_m_s": 0.5})
     assert once["sole_force_N"] == pytest.approx(found["sole_force_N"][3], rel=1e-6)
     assert once["zmp_margin_m"] is None
@@ -190,7 +190,7 @@ def test_a_nail_that_is_touched_again_is_told(stiffness: float, again: bool) -> 
     contact = {"law": "Kelvin-Voigt", "stiffness_N_m": stiffness, "damping_N_s_m": 20.0}
     data = {**arm_file().data, "target": nail, "contact": contact}
     given = {"posture": "ready", "speed_m_s": 3.0, "model": "virtual-mass"}
-    found = collide_once(problem_file_from_data(data, where="nail.toml"), given)
+    found = collide_once(ProblemFile.from_data(data, Path("nail.toml")), given)
 
     def motion(_: float, y: Any) -> list[float]:
         hand, at, speed, moves = y
@@ -303,7 +303,7 @@ def test_a_contact_too_stiff_for_its_friction_has_a_model_that_takes_it() -> Non
     """It was told to give a step, which neither the command nor a file has."""
     data = {**arm_file().data, "friction": {"coefficient": 0.5}, "contact": {"stiffness_N_m": 1e7}}
     data["contact"]["damping_N_s_m"] = 50.0
-    file, given = problem_file_from_data(data, where="stiff.toml"), {"posture": "ready", "speed_m_s": 0.5}
+    file, given = ProblemFile.from_data(data, Path("stiff.toml")), {"posture": "ready", "speed_m_s": 0.5}
     with pytest.raises(InputError, match=r"take FullDynamics \(\[at_contact\] model, or --model: 'full'\)"):
         collide_once(file, given)
     with pytest.raises(InputError, match=r"in every collision, as in the first, where .* take FullDynamics"):
@@ -342,7 +342,7 @@ def soft_grip_file() -> ProblemFile:
     soft = {"preset": "planar_arm", "tools": [mallet], "grips": {"mallet": grip}}
     data = {**arm_file().data, "robot": soft}
     data["problem"] = {k: x for k, x in data["problem"].items() if k != "robot"} | {"striker": "mallet"}
-    return problem_file_from_data(data, where="grip")
+    return ProblemFile.from_data(data, Path("grip"))
 
 
 def test_gains_of_all_joints_leave_a_soft_grip_as_it_is() -> None:
@@ -376,7 +376,7 @@ def test_a_robot_of_little_weight_has_a_zmp_too() -> None:
         section = {"preset": "standin", "gravity_m_s2": [0.0, 0.0, -gravity]}
         data = {**standin_file().data, "robot": section}
         data["problem"] = {key: x for key, x in data["problem"].items() if key != "robot"}
-        file = problem_file_from_data(data, where="light.toml")
+        file = ProblemFile.from_data(data, Path("light.toml"))
         margins.append(collide_many(file, {}, at_contact=given, outputs=("zmp_margin_m",))["zmp_margin_m"][0])
     assert margins[1] == pytest.approx(margins[0], abs=1e-3)
 
@@ -388,7 +388,7 @@ def with_stance(sections: dict[str, Any], ahead: float = 0.4) -> ProblemFile:
     """The stand-in's file with other sections and a hit point `ahead` [m]."""
     data = {**standin_file().data, **sections}
     data["problem"] = {**data["problem"], "point_m": [ahead, -0.2, 0.9]}
-    return problem_file_from_data(data, where="standin.toml")
+    return ProblemFile.from_data(data, Path("standin.toml"))
 
 
 @pytest.mark.slow

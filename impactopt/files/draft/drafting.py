@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Mask
 from impactopt.bodies.convex_hulls import seen_pieces
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
 from impactopt.errors import InputError, counted
@@ -27,7 +27,7 @@ from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_edge, find_striker, find_toe
 from impactopt.files.draft.strong import FOLLOW, ITERATIONS, SECONDS, SWING, Strong, durations, strongest
 from impactopt.files.draft.target_placement import STRIKE_DIRECTIONS, Arm, aims, ready
-from impactopt.files.problem_file.reading import problem_file_from_data
+from impactopt.files.problem_file.reading import ProblemFile
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.writing import ROBOT_KEYS, relative_path, section_data, sole_data
 from impactopt.files.sections.robot import StrikerSection, ToolSection
@@ -46,7 +46,6 @@ from impactopt.robots.checks import REPAIRED
 from impactopt.robots.gains import USUAL_ROTOR
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 MAX_TARGETS = 8  # tried
 MAX_MOTIONS = 2  # whole motions of a bolted arm that are compared
 # A strike is planned for if its objective is at least so much of the hardest motion's.
@@ -124,6 +123,28 @@ def draft_problem(
         raise InputError("; ".join([*causes, str(error)])) from error
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Case:
+    """A robot to draft for, and what is found on it.
+
+    arms : the one that strikes first.  forward (3,) : in the root's frame.  folder : of the file.
+    say : reports progress.
+    """
+
+    drafted: Drafted
+    soles: list[Sole]
+    forward: Array
+    strikers: list[Striker]
+    arms: list[Arm]
+    folder: Path
+    say: Callable[[str], None]
+
+    @property
+    def joints(self) -> str:
+        """Text with the robot's name and number of joints."""
+        return f"{self.drafted.robot.name}: {self.drafted.robot.n} joints"
+
+
 def _of_motion(
     drafted: Drafted, motion: str | None, folder: Path, say: Callable[[str], None], *, planned: bool
 ) -> Draft:
@@ -137,21 +158,23 @@ def _of_motion(
     arms, strikers = _arms(drafted)
     if motion not in (None, "kick") and not arms:
         raise InputError(f"{path}: there is no limb beside the legs to {motion} with; let it kick")
+    case = _Case(
+        drafted=drafted, soles=soles, forward=forward, strikers=strikers, arms=arms, folder=folder, say=say
+    )
     if soles and (motion == "kick" or not arms):
-        return _kick(drafted, soles, strikers, forward, folder)
+        return _kick(case)
     if soles and motion in FROM_ABOVE:
-        say(f"{drafted.robot.name}: {drafted.robot.n} joints, on two legs; looking for a strike from above")
-        return _stroke(drafted, soles, strikers, arms[0], forward, motion, folder, say)
+        return _stroke(case, motion)
     if not soles:
-        return _bolted(drafted, strikers, arms, motion, folder, say, planned=planned)
-    say(f"{drafted.robot.name}: {drafted.robot.n} joints, on two legs; looking for a posture and a target")
+        return _bolted(case, motion, planned=planned)
+    say(f"{case.joints}, on two legs; looking for a posture and a target")
     try:
-        return _punch(drafted, soles, strikers, arms, forward, folder)
+        return _punch(case)
     except InputError as no_punch:
         if motion == "punch":
             raise
         try:
-            kick = _kick(drafted, soles, strikers, forward, folder)
+            kick = _kick(case)
         except InputError:
             raise no_punch from None
         return replace(kick, said=(*kick.said, f"a kick is drafted, as there is no punch: {no_punch}"))
@@ -162,13 +185,12 @@ def _draft(data: dict[str, Any], drafted: Drafted, robot: Robot, *messages: str)
     return Draft(text=_text(data, drafted, robot), said=(*_messages(data, drafted, robot), *messages))
 
 
-def _standing(
-    drafted: Drafted, soles: list[Sole], strikers: list[Striker], forward: Array
-) -> tuple[Robot, tuple[Limb, ...], Array]:
+def _standing(case: _Case) -> tuple[Robot, tuple[Limb, ...], Array]:
     """The robot with soles and strikers, its legs, and its half-sitting configuration (nq,)."""
-    robot = drafted.made(soles=soles, strikers=strikers)
+    drafted, soles = case.drafted, case.soles
+    robot = drafted.made(soles=soles, strikers=case.strikers)
     legs = tuple(renumbered(leg, drafted.robot.model, robot.model) for leg in drafted.legs)
-    return robot, legs, half_sitting(robot, legs, soles, forward)
+    return robot, legs, half_sitting(robot, legs, soles, case.forward)
 
 
 def _renumbered(arms: Sequence[Arm], drafted: Drafted, robot: Robot) -> list[Arm]:
@@ -176,40 +198,24 @@ def _renumbered(arms: Sequence[Arm], drafted: Drafted, robot: Robot) -> list[Arm
     return [replace(arm, limb=renumbered(arm.limb, drafted.robot.model, robot.model)) for arm in arms]
 
 
-def _punch(
-    drafted: Drafted,
-    soles: list[Sole],
-    strikers: list[Striker],
-    arms: list[Arm],
-    forward: Array,
-    folder: Path,
-) -> Draft:
+def _punch(case: _Case) -> Draft:
     """Draft of a punch ahead by a robot on its legs.
 
     Raises
     ------
     InputError : no posture or no target is found.
     """
-    robot, _, q = _standing(drafted, soles, strikers, forward)
-    arms = _renumbered(arms, drafted, robot)
+    robot, _, q = _standing(case)
+    arms = _renumbered(case.arms, case.drafted, robot)
     q, way = ready(robot, arms, q, directions=STRIKE_DIRECTIONS[:1])
-    data = _data(drafted, robot, soles, strikers, q, folder)
+    data = _data(case, robot, q)
     # from the start: a push that slides off the target is refused for its replay before its slide is bounded
     data["terms"]["slide"] = {"most_m": Slide().most}
-    data, _ = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
-    return _draft(data, drafted, robot)
+    data, _ = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, case.folder)
+    return _draft(data, case.drafted, robot)
 
 
-def _bolted(
-    drafted: Drafted,
-    strikers: list[Striker],
-    arms: list[Arm],
-    motion: str | None,
-    folder: Path,
-    say: Callable[[str], None],
-    *,
-    planned: bool,
-) -> Draft:
+def _bolted(case: _Case, motion: str | None, *, planned: bool) -> Draft:
     """Draft for a robot on a fixed base: the hardest of the strikes that are solved, else a target within
     reach.
 
@@ -217,9 +223,10 @@ def _bolted(
     ------
     InputError : no posture or no target is found.
     """
-    robot = drafted.made(soles=[], strikers=strikers)
-    arms = _renumbered(arms, drafted, robot)
-    say(f"{robot.name}: {robot.n} joints, on a fixed base; trying strikes (compiles the first time)")
+    drafted, folder, say = case.drafted, case.folder, case.say
+    robot = drafted.made(soles=[], strikers=case.strikers)
+    arms = _renumbered(case.arms, drafted, robot)
+    say(f"{case.joints}, on a fixed base; trying strikes (compiles the first time)")
     q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
     targets = hits(motion, robot)
     strong, hit, edgewise, why = _hardest(robot, arms[0], q, targets)
@@ -233,7 +240,7 @@ def _bolted(
 
         @cache
         def strike_of(k: int) -> tuple[dict[str, Any], ImpactProblem]:
-            return _aimed_strike(drafted, robot, strikers, striking, strong[k], hit, edgewise, folder)
+            return _aimed_strike(case, robot, striking, strong[k], hit, edgewise)
 
         best = _hardest_planned(lambda k: strike_of(k)[1], strong, say) if planned else None
         data, problem = strike_of(best[0] if best else 0)
@@ -253,7 +260,7 @@ def _bolted(
             q, way = ready(
                 robot, arms, q, directions=[tuple(DOWN)] if motion in FROM_ABOVE else STRIKE_DIRECTIONS
             )
-            data = {**_data(drafted, robot, [], strikers, q, folder), **hit.data}
+            data = {**_data(case, robot, q), **hit.data}
             data, _ = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
         except InputError as no_target:
             below = -float(striking_point(robot, arms[0].name, rested(robot))[2])
@@ -311,53 +318,39 @@ def _peg(robot: Robot, arm: Arm) -> Tool:
 
 
 def _aimed_strike(
-    drafted: Drafted,
-    robot: Robot,
-    strikers: list[Striker],
-    arm: Arm,
-    strong: Strong,
-    hit: Hit,
-    edgewise: bool,
-    folder: Path,
+    case: _Case, robot: Robot, arm: Arm, strong: Strong, hit: Hit, edgewise: bool
 ) -> tuple[dict[str, Any], ImpactProblem]:
     """Data of a bolted arm's strike, and its problem."""
-    data = {**_data(drafted, robot, [], strikers, strong.start, folder), **hit.data}
+    data = {**_data(case, robot, strong.start), **hit.data}
     way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
     for phase, bounds in durations(robot, way).items():
         data[phase]["duration_s"] = list(bounds)
     data = _edgewise(data) if edgewise else data
-    return _aimed(data, arm.name, iter([strong.point]), strong.normal, folder)
+    return _aimed(data, arm.name, iter([strong.point]), strong.normal, case.folder)
 
 
-def _stroke(
-    drafted: Drafted,
-    soles: list[Sole],
-    strikers: list[Striker],
-    arm: Arm,
-    forward: Array,
-    motion: str,
-    folder: Path,
-    say: Callable[[str], None],
-) -> Draft:
+def _stroke(case: _Case, motion: str) -> Draft:
     """Draft of a strike from above by a robot on its legs, with the lower side of the hand.
 
     Raises
     ------
     InputError : the hand has no shape; no posture or no target is found.
     """
-    robot, _, q = _standing(drafted, soles, strikers, forward)
+    drafted, folder, arm = case.drafted, case.folder, case.arms[0]
+    case.say(f"{case.joints}, on two legs; looking for a strike from above")
+    robot, _, q = _standing(case)
     (hand,) = _renumbered([arm], drafted, robot)
     q, _ = ready(robot, [hand], q, directions=STRIKE_DIRECTIONS[:1])
     name = arm.name.removesuffix("hand") + "edge"
     edge, below = find_edge(robot.model, hand.limb, name, bodies_of(robot).of_joint, arm.axis, q)
-    strikers = [*strikers, edge]
-    robot, _, q = _standing(drafted, soles, strikers, forward)
+    case = replace(case, strikers=[*case.strikers, edge])
+    robot, _, q = _standing(case)
     (hand,) = _renumbered([Arm(limb=arm.limb, name=name, axis=below)], drafted, robot)
     q, way = ready(robot, [hand], q, directions=[tuple(DOWN)])
     # the easiest target: on soles, a strike alone is far harder than the strike of a whole motion
-    data = {**_data(drafted, robot, soles, strikers, q, folder), **hits(motion, robot)[-1].data}
+    data = {**_data(case, robot, q), **hits(motion, robot)[-1].data}
     points, tried = aims(robot, hand, q, way), list[tuple[dict[str, Any], StrikeSolution]]()
-    say("trying strikes with any part of the hand (compiles the first time)")
+    case.say("trying strikes with any part of the hand (compiles the first time)")
     while len(tried) < MAX_STROKES and not any(solved.status.usable for _, solved in tried):
         try:
             aimed, _ = _aimed(data, name, points, way, folder)
@@ -372,7 +365,7 @@ def _stroke(
         messages = [f"{UNSOLVED}{NEAREST}{solved.result.message}"]
     else:
         # with the face to the target, most strikes are only solved from this one as the initial guess
-        say("turning the hand's face to the target")
+        case.say("turning the hand's face to the target")
         if not _strike(data, folder, start=solved).status.usable:
             data, messages = _edgewise(data), [EDGEWISE]
     return _draft(data, drafted, robot, *messages)
@@ -391,19 +384,14 @@ def _strike(data: dict[str, Any], folder: Path, *, start: StrikeSolution | None 
         return optimize_strike(_built(data, folder), start=start, options=options, time_limit=SECONDS)
 
 
-def _kick(
-    drafted: Drafted,
-    soles: list[Sole],
-    strikers: list[Striker],
-    forward: Array,
-    folder: Path,
-) -> Draft:
+def _kick(case: _Case) -> Draft:
     """Draft of a kick from two feet and back to them, with the toe, against a ball on the ground.
 
     Raises
     ------
     InputError : a sole has a hinge; no posture or no target is found.
     """
+    drafted, soles = case.drafted, case.soles
     if any(sole.hinge is not None for sole in soles):
         raise InputError(
             f"{drafted.path}: legs of five joints cannot kick: a foot in the air would swing on its hinge; "
@@ -412,13 +400,13 @@ def _kick(
     lifted = max(range(len(soles)), key=lambda k: soles[k].name == "right")
     foot, stands = soles[lifted], soles[1 - lifted]
     toe = find_toe(drafted.robot.model, drafted.legs[lifted].tip, foot, drafted.pieces)
-    strikers = [*strikers, toe]
-    robot, legs, q = _standing(drafted, soles, strikers, forward)
+    case = replace(case, strikers=[*case.strikers, toe])
+    robot, legs, q = _standing(case)
     at = striking_point(robot, toe.name, q)
     kinematics = robot.model.createData()
     pin.forwardKinematics(robot.model, kinematics, q)
     hip_height = float(kinematics.oMi[legs[1 - lifted].own[0]].translation[2])
-    data = _data(drafted, robot, soles, strikers, q, folder)
+    data = _data(case, robot, q)
     size = float(f"{min(BALL, 0.3 * hip_height):.2g}")
     mass = float(f"{np.clip(0.005 * sum(body.mass for body in robot.model.inertias), 0.1, 0.45):.2g}")
     both = {"soles": [sole.name for sole in soles], "duration_s": list(SHIFT), "intervals": 8, "grading": 1.0}
@@ -426,7 +414,7 @@ def _kick(
     data["target"] = {"mass_kg": mass, "body": {"shape": "ball", "size_m": [size]}}
     data["contact"] = {"stiffness_N_m": 2e4, "damping_N_s_m": 20.0}
     points = (np.round([part * hip_height, at[1], size / 2], 3) + 0.0 for part in KICKS)
-    data, _ = _aimed(data, toe.name, points, np.array(STRIKE_DIRECTIONS[0]), folder)
+    data, _ = _aimed(data, toe.name, points, np.array(STRIKE_DIRECTIONS[0]), case.folder)
     return _draft(data, drafted, robot)
 
 
@@ -491,12 +479,13 @@ def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
     return arms, strikers
 
 
-def _data(
-    drafted: Drafted, robot: Robot, soles: list[Sole], strikers: list[Striker], q: Array, folder: Path
-) -> dict[str, Any]:
+def _data(case: _Case, robot: Robot, q: Array) -> dict[str, Any]:
     """Data of a problem file with a robot in its start posture q (nq,), without a hit point."""
-    options = drafted.options
-    keys: dict[str, Any] = {drafted.kind.lower(): relative_path(drafted.path, folder), "name": robot.name}
+    drafted, soles, options = case.drafted, case.soles, case.drafted.options
+    keys: dict[str, Any] = {
+        drafted.kind.lower(): relative_path(drafted.path, case.folder),
+        "name": robot.name,
+    }
     if "floating" in options:
         keys["floating"] = options["floating"]
     for option in ("locked", "armature", "torque_limit", "velocity_limit", "position_limit"):
@@ -504,7 +493,7 @@ def _data(
             keys[ROBOT_KEYS[option]] = dict(options[option])
     if soles:
         keys["soles"] = [sole_data(sole) for sole in soles]
-    keys["strikers"] = [section_data(StrikerSection, striker) for striker in strikers]
+    keys["strikers"] = [section_data(StrikerSection, striker) for striker in case.strikers]
     keys |= {"tools": [section_data(ToolSection, tool) for tool in robot.tools]} if robot.tools else {}
     angles = zip(robot.joint_names, robot.joint_positions(q), robot.hinges, strict=True)
     keys["postures_rad"] = {START: {joint: round(float(x), 5) for joint, x, hinge in angles if not hinge}}
@@ -579,7 +568,7 @@ def _aimed(
 def _built(data: dict[str, Any], folder: Path) -> ImpactProblem:
     """The problem of drafted data, with repaired inertias."""
     tried = {**data, "robot": {**data["robot"], "inertias": REPAIRED}}
-    return problem_file_from_data(tried, where=folder / "draft.toml").build()
+    return ProblemFile.from_data(tried, folder / "draft.toml").build()
 
 
 def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
@@ -706,7 +695,7 @@ def _wrong(drafted: Drafted) -> str:
     return f"{counted(len(drafted.wrong), 'inertia is', 'inertias are')} not physical"
 
 
-def _guessed_gains(robot: Robot) -> NDArray[np.bool_]:
+def _guessed_gains(robot: Robot) -> Mask:
     """Mask (n,) of joints whose gains are the defaults of a description without gains."""
     damping, stiffness = default_kd(robot.torque_limit), default_kp(robot.kd)
     return np.isclose(robot.kd, damping) & np.isclose(robot.kp, stiffness) & ~robot.hinges

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.contact.fields import snake_case
 from impactopt.contact.laws import ContactLaw, KelvinVoigt, SpringDamper
 from impactopt.contact.targets import Board, FreeMass, Nail, Target
@@ -17,7 +17,6 @@ from impactopt.problem.objectives import Objective, PeakForce, TargetEnergy
 from impactopt.problem.strength import DOWN, NORMALS
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 MASS_RATIO = 0.06  # of a punched target to the robot
 MASSES = (0.5, 5.0)  # [kg] least and largest mass of a punched target
 PAPER_DAMPING = 300.0  # [N s/m] of the contact with the largest one

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.convex_hulls import Piece
 from impactopt.robots.build import effort_limit, friction, is_floating, neutral
 from impactopt.robots.checks import LEG
 
-Array = NDArray[np.float64]
 _FINGERS = re.compile(r"finger|thumb|gripper|jaw|claw|knuckle|(?<![a-z])eyes?(?![a-z])", re.IGNORECASE)
 _WHEELS = re.compile(r"wheel|caster|roller", re.IGNORECASE)
 _ARMS = re.compile(r"shoulder|elbow|wrist", re.IGNORECASE)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from impactopt.arrays import Array, Index
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
@@ -19,7 +19,6 @@ from impactopt.robots.checks import LEG
 from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot, Sole
 
-Array = NDArray[np.float64]
 SQUAT = 0.06  # lowering of the hips, over the length of the legs
 LEVEL = 1e-5  # [m], [rad]: tolerance of a sole's placement, to which angles are written and files have axes
 STARTS = 10  # random initial guesses
@@ -258,13 +257,13 @@ def _leg(
     return _set(robot, q, own, best[1])
 
 
-def _columns(robot: Robot, joints: Sequence[int]) -> NDArray[np.intp]:
+def _columns(robot: Robot, joints: Sequence[int]) -> Index:
     """Indices into arrays of length n of joints of the model, each once; a follower has its leader's."""
     base = robot.nv - robot.n
     return np.array(list(dict.fromkeys(robot.model.joints[j].idx_v - base for j in joints)), dtype=np.intp)
 
 
-def _limits(robot: Robot, own: NDArray[np.intp]) -> tuple[Array, Array]:
+def _limits(robot: Robot, own: Index) -> tuple[Array, Array]:
     """Position limits of joints, of a turn at most, tightened by a margin."""
     low, high = (limits[own] for limits in drawn_ranges(robot))
     margin = np.minimum(MARGIN * (high - low) / 2, 0.15)
@@ -305,13 +304,13 @@ def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
     return min(tries, key=lambda one: one[:2])[2]
 
 
-def _gravity_share(robot: Robot, data: pin.Data, q: Array, own: NDArray[np.intp]) -> Array:
+def _gravity_share(robot: Robot, data: pin.Data, q: Array, own: Index) -> Array:
     """Gravity torques of joints at q (nq,) over their torque limits."""
     gravity = robot.generalized_gravity(data, q)
     return np.asarray(np.abs(gravity[robot.nv - robot.n + own]) / robot.torque_limit[own])
 
 
-def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:
+def _set(robot: Robot, q: Array, own: Index, angles: Array) -> Array:
     """The configuration with other angles of some joints; own : their indices in arrays of length n."""
     every = robot.angles.of(q)
     every[own] = angles

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.codegen.files import is_plain_file
@@ -25,7 +24,6 @@ from impactopt.robots.presets import example_robots
 from impactopt.robots.robot import Robot
 from impactopt.robots.urdf import read_urdf
 
-Array = NDArray[np.float64]
 # reasons for which a joint is locked; many files have no effort of joints that have a motor
 FIXED = "fixed in the file"
 NO_MOTOR = "no motor, as the file has no effort: else unlock it, with torque_limit_N_m"

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from impactopt.arrays import Array
 from impactopt.bodies.convex_hulls import Piece
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
@@ -18,7 +18,6 @@ from impactopt.robots.attachments import Sole
 from impactopt.robots.build import neutral
 from impactopt.robots.checks import LEG
 
-Array = NDArray[np.float64]
 SLICE = 0.005  # [m]: the part of a foot so near to its lowest plane is the sole
 STEEP = np.cos(np.radians(40))  # least cosine between the normals of sole and ground in the zero posture
 MAX_CORNERS = 8  # of a polygon

@@ -7,15 +7,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.convex_hulls import Piece, inertia_box, is_far
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb
 from impactopt.robots.attachments import Sole, Striker
 from impactopt.robots.model import axis_of
 
-Array = NDArray[np.float64]
 # names of tool frames by ROS-Industrial (tool0), manufacturers and MuJoCo Menagerie (sites), the most
 # reliable first
 _TOOLS = tuple(

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.clearance import Places
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.contact.targets import FreeMass
@@ -27,7 +27,6 @@ from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
 
-Array = NDArray[np.float64]
 MAX_STRIKES, MAX_CANDIDATES = 6, 60  # impacts solved as strikes; estimated impacts considered for them
 MIN_DISTANCE, ALIKE = 0.2, 0.6  # of hit points, over the reach, if the cosine of their normals is larger
 # The start posture is that of contact, moved back at the contact velocity for so long [s], so that the joint

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb
 from impactopt.files.draft.postures import arm_length, bend_arm, shoulder
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 # horizontal
 STRIKE_DIRECTIONS = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))
 # Positions relative to the shoulder, over the arm's length, in the order tried:

@@ -16,9 +16,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from impactopt import __version__
+from impactopt.arrays import Array, Index, Mask
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
@@ -110,7 +110,6 @@ def _check_replaceable(directory: Path, to: str) -> None:
             raise InputError(f"cannot write {folder}: it is read-only; give another directory with --out")
 
 
-Array = NDArray[np.float64]
 MIN_RATE, MAX_RATE = 1.0, 1e5  # [Hz]
 PHASES = ("swing", "contact", "follow-through")
 EXPECTED = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
@@ -130,14 +129,14 @@ class Export:
 
     planned: Planned
     joints: tuple[str, ...]
-    order: NDArray[np.intp]
+    order: Index
     rate: float
     gravity: bool
     smooth: Mapping[str, Any] | None
     motion: Motion
     missed: Motion | None
 
-    def standing(self, motion: Motion) -> dict[str, NDArray[np.bool_]]:
+    def standing(self, motion: Motion) -> dict[str, Mask]:
         """Mask (k,) of the instants at which each sole stands, by its name; {} without stance phases."""
         p = self.problem
         if motion.stance is None:
@@ -365,7 +364,7 @@ def _without_gravity(reference: Trajectory, robot: Robot) -> Trajectory:
     return dataclasses.replace(reference, torque=reference.torque - np.where(robot.passive, 0.0, weight))
 
 
-def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] | None) -> NDArray[np.intp]:
+def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] | None) -> Index:
     """Indices of the joints in the order of the export; InputError as of `export_of`."""
     unusable = {s.value: s.message for s in Status if not s.usable}
     if status in unusable:
@@ -379,7 +378,7 @@ def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] |
     return joint_order(robot, joints)
 
 
-def joint_order(robot: Robot, joints: Sequence[str] | None) -> NDArray[np.intp]:
+def joint_order(robot: Robot, joints: Sequence[str] | None) -> Index:
     """Indices of an export's joints in the robot's arrays.
 
     Raises

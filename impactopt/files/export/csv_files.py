@@ -5,13 +5,9 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from impactopt.arrays import Array
 from impactopt.files.export.content import Export
 from impactopt.files.export.motion import Motion
-
-Array = NDArray[np.float64]
 
 
 def write(export: Export, directory: Path) -> None:

@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Mask
 from impactopt.errors import InputError
 from impactopt.files.export.content import Export, body_name
 from impactopt.files.export.motion import Motion, motion_at
 from impactopt.robots.model import JointAngles
-
-Array = NDArray[np.float64]
 
 
 def write(export: Export, directory: Path) -> None:
@@ -74,7 +72,7 @@ def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
     }
 
 
-def _contacts(standing: dict[str, NDArray[np.bool_]]) -> dict[str, Any]:
+def _contacts(standing: dict[str, Mask]) -> dict[str, Any]:
     """Mask (k, soles) of the soles that stand, and their names; {} without stance phases."""
     if not standing:
         return {}

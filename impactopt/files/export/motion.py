@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.interpolate import BPoly, PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.kinematics.stance import zmp
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
 
-Array = NDArray[np.float64]
 JUMP = 1e-6  # [s] between the two samples at a jump, so that time is strictly ascending
 CONTACT = 1  # phase
 
@@ -49,7 +48,7 @@ class Motion:
     """
 
     time: Array
-    phase: NDArray[np.intp]
+    phase: Index
     position: Array
     velocity: Array
     acceleration: Array
@@ -60,14 +59,14 @@ class Motion:
     contact_start: float
     contact_end: float
     end: float
-    stance: NDArray[np.intp] | None = None
+    stance: Index | None = None
 
 
 def motion_at(
     reference: Trajectory,
     robot: Robot,
     rate: float,
-    order: NDArray[np.intp],
+    order: Index,
     arrays: Mapping[str, Any],
     *,
     jumps: bool = True,
@@ -130,7 +129,7 @@ def motion_at(
     )
 
 
-def _stances(reference: Trajectory, time: Array) -> NDArray[np.intp] | None:
+def _stances(reference: Trajectory, time: Array) -> Index | None:
     """Index of the stance phase at each instant (k,) [s]; None without stance phases."""
     if not reference.stance.size:
         return None
@@ -138,7 +137,7 @@ def _stances(reference: Trajectory, time: Array) -> NDArray[np.intp] | None:
     return reference.stance[samples.clip(0)]
 
 
-def with_passive_at_rest(motion: Motion, passive: NDArray[np.bool_]) -> Motion:
+def with_passive_at_rest(motion: Motion, passive: Mask) -> Motion:
     """The motion with constant references of passive joints (n,): position and effort are those at the start.
 
     They have no servos.
@@ -216,7 +215,7 @@ def _quintics(knots: Array, value: Array, first: Array, second: Array) -> BPoly:
 def _phase(
     phase: int,
     times: Array,
-    own: NDArray[np.intp],
+    own: Index,
     reference: Trajectory,
     curves: tuple[Array, Array, Array],
     arrays: Mapping[str, Any],

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from impactopt.arrays import Array
 from impactopt.bodies.solids import Solid, simplified
 from impactopt.bodies.visuals import joined_visuals
 from impactopt.bodies.world import face_axes
@@ -32,7 +32,6 @@ from impactopt.simulation.mujoco_world import (
 )
 from impactopt.simulation.perturbation import Perturbation
 
-Array = NDArray[np.float64]
 SCENE, REFERENCE, PLAYER, MESHES = "scene.xml", "reference.npz", "play.py", "meshes"
 MAX_STEP = 2e-4  # [s]
 HAND_MASS = 1.0  # [kg] for the contact's fastest time, if the target is heavier

@@ -7,16 +7,15 @@ from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError, check_array
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import JointAcceleration, JointJerk
 from impactopt.problem.terms.base import of_joints
 from impactopt.transcription.plan import Trajectory, complete_reference
 
-Array = NDArray[np.float64]
 MIN_STEP, MAX_STEPS = 2e-3, 3000  # [s] of constant jerk, and their number
 EXTRA_TIME = 0.1  # [s] that the smoothed motion is longer
 # weight of deviations from so long [s] before contact to its end, where they cost impulse; 1 elsewhere

@@ -13,9 +13,6 @@ from impactopt.files.problem_file.reading import ProblemFile as ProblemFile
 from impactopt.files.problem_file.reading import change_data as change_data
 from impactopt.files.problem_file.reading import key_place as key_place
 from impactopt.files.problem_file.reading import load_problem as load_problem
-from impactopt.files.problem_file.reading import parse_problem_file as parse_problem_file
-from impactopt.files.problem_file.reading import problem_file_from_data as problem_file_from_data
-from impactopt.files.problem_file.reading import problem_from_data as problem_from_data
 from impactopt.files.problem_file.reading import read_problem_file as read_problem_file
 from impactopt.files.problem_file.sections import SolverSettings as SolverSettings
 from impactopt.files.problem_file.writing import problem_data as problem_data

@@ -103,23 +103,6 @@ def load_problem(path: str | os.PathLike[str]) -> ImpactProblem:
     return read_problem_file(path).build()
 
 
-def problem_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str]) -> ImpactProblem:
-    """The problem of a problem file's data, as of `read_toml` or `change_data`.
-
-    where : path of the file in messages; paths in the data are relative to its folder.
-
-    Raises
-    ------
-    InputError : the data are wrong; one message with all mistakes.
-    """
-    return problem_file_from_data(data, where=where).build()
-
-
-def problem_file_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str]) -> ProblemFile:
-    """Data checked like the text of a problem file, with that text; see `problem_from_data`."""
-    return ProblemFile.from_data(data, Path(where))
-
-
 def read_problem_file(
     path: str | os.PathLike[str], settings: Mapping[str, Any] | None = None, *, names: bool = False
 ) -> ProblemFile:
@@ -133,16 +116,6 @@ def read_problem_file(
     InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
     """
     return (_WithNames if names else ProblemFile).read(path, settings)
-
-
-def parse_problem_file(text: str, path: Path, settings: Mapping[str, Any] | None = None) -> ProblemFile:
-    """A problem file's text, checked like a file at `path`, to whose folder paths in it are relative.
-
-    Raises
-    ------
-    InputError : the text is wrong; one message with all mistakes and their lines.
-    """
-    return ProblemFile.parse(text, path, settings)
 
 
 class _WithNames(ProblemFile):

@@ -14,7 +14,7 @@ from impactopt.bodies.world import TargetBody
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_kind, named_table
-from impactopt.files.problem_file.reading import problem_file_from_data
+from impactopt.files.problem_file.reading import ProblemFile
 from impactopt.files.problem_file.sections import ELEMENTS, File, SolverSettings, comment_at, defaults_of
 from impactopt.files.sections.collision import LAWS, TARGETS, Body, ProblemSection
 from impactopt.files.sections.diagnostics import section_in
@@ -193,7 +193,7 @@ def write_problem(
     if solver is not None:
         check_kind("solver", solver, SolverSettings)
         data["solver"] = _solver(solver)
-    read = problem_file_from_data(data, where=Path(folder) / "problem.toml")
+    read = ProblemFile.from_data(data, Path(folder) / "problem.toml")
     if read.build().hash != problem.hash:
         raise InputError(
             f"the problem cannot be written to a file: its robot {problem.robot.name!r} has changes that a "

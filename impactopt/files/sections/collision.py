@@ -10,10 +10,9 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, PlainValidator, create_model
 
+from impactopt.arrays import Array
 from impactopt.bodies.world import TargetBody
 from impactopt.contact import laws, targets
 from impactopt.contact.friction import ContactFriction
@@ -36,6 +35,7 @@ from impactopt.files.sections.values import (
     optional,
     required,
     section_of,
+    usual,
 )
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, FixedBase, Free, OneSole, Stance
 from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
@@ -54,9 +54,7 @@ class Target(Section):
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "target_kind"
     apart: ClassVar[tuple[str, ...]] = ("body",)
-    target_kind: TargetKind = Field(
-        default=targets.TARGETS[0].word, alias="kind", description="kind of target"
-    )
+    target_kind: TargetKind = usual(targets.TARGETS[0].word, "kind of target", "kind")
     body: Body = optional("")
 
 
@@ -71,7 +69,7 @@ class Contact(Section):
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "law"
-    law: LawKind = Field(default=laws.LAWS[0].word, description="contact law")
+    law: LawKind = usual(laws.LAWS[0].word, "contact law")
 
 
 class _KnownContact(Contact):
@@ -118,22 +116,15 @@ class ProblemSection(Section):
         "hit point: x forward, y left, z up from the ground, or from a fixed base [m]", "point_m"
     )
     normal: UnitVector = required("direction in which the target is pushed")
-    start: Posture = Field(
-        default=USUAL_POSTURE,
-        description="start posture: its name, or a configuration of Pinocchio",
-    )
+    start: Posture = usual(USUAL_POSTURE, "start posture: its name, or a configuration of Pinocchio")
 
 
 class StanceSection(Section):
     """Fixed soles, and supporting hands."""
 
-    soles: str = Field(
-        default="both",
-        description='"both", or one; "none": the robot floats freely',
-    )
-    hands: HandNames = Field(
-        default=[],
-        description="strikers that are fixed at their places in the start posture; see [terms.grip]",
+    soles: str = usual("both", '"both", or one; "none": the robot floats freely')
+    hands: HandNames = usual(
+        [], "strikers that are fixed at their places in the start posture; see [terms.grip]"
     )
 
 
@@ -283,7 +274,7 @@ class CollisionSections(Section):
         stance.constraint_frames(robot)
         return stance
 
-    def stance_at_impact(self, robot: Robot) -> tuple[Stance, NDArray[np.float64]]:
+    def stance_at_impact(self, robot: Robot) -> tuple[Stance, Array]:
         """Stance of a robot at the impact, and a posture (nq,) in which its soles stand where they do then.
 
         They are those of the phase with the impact in [[stances]], after its steps, or of [stance] and the
@@ -308,7 +299,7 @@ class CollisionSections(Section):
                 "[second]: a collision model has one striker: leave the section out, or solve the problem"
             )
 
-    def make_start(self, robot: Robot) -> NDArray[np.float64]:
+    def make_start(self, robot: Robot) -> Array:
         """The start posture (nq,); InputError for one that the robot cannot have."""
         start = self.problem.start
         return (

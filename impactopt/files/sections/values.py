@@ -199,6 +199,11 @@ def required(about: str, key: str | None = None) -> Any:
     return Field(alias=key, description=about)
 
 
+def usual(default: Any, about: str, key: str | None = None) -> Any:
+    """A key with a default of its own; other arguments as of `optional`."""
+    return Field(default=default, alias=key, description=about)
+
+
 def attribute_docs(kind: type) -> dict[str, str]:
     """Description of each attribute in the docstrings of a class and its bases, on one line; `a, b : text`
     describes both.

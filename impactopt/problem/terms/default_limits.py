@@ -5,12 +5,12 @@ The transcription adds their constraints; `GroundForce` adds its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from impactopt.contact.fields import about
+from impactopt.contact.fields import described
 from impactopt.errors import InputError
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import Measure, degrees
@@ -25,11 +25,8 @@ class TorqueLimit(Term):
 
     name: ClassVar[str] = "torque limit"
     unit: ClassVar[str] = "of limit"
-    fraction: float = field(
-        default=0.85,
-        metadata=about("share of the limit in swing and follow-through", above=0, most=1),
-    )
-    collision: float = field(default=0.85, metadata=about("share of the limit in contact", above=0, most=1))
+    fraction: float = described(0.85, "share of the limit in swing and follow-through", above=0, most=1)
+    collision: float = described(0.85, "share of the limit in contact", above=0, most=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +39,7 @@ class VelocityLimit(Term):
 
     name: ClassVar[str] = "velocity limit"
     unit: ClassVar[str] = "of limit"
-    fraction: float = field(default=0.95, metadata=about("share of the limit", above=0, most=1))
+    fraction: float = described(0.95, "share of the limit", above=0, most=1)
 
     def most(self, robot: Robot) -> Any:
         """Largest magnitude (n,) of each joint's velocity [rad/s] or [m/s]."""
@@ -60,7 +57,7 @@ class PositionLimit(Term):
 
     name: ClassVar[str] = "position limit"
     unit: ClassVar[str] = "rad"
-    margin: float = field(default=0.02, metadata=about("distance from each limit", unit="rad", least=0))
+    margin: float = described(0.02, "distance from each limit", unit="rad", least=0)
 
     def add_constraints(self, program: Any) -> None:
         """Add the constraints of the tendons; joints have bounds of variables."""
@@ -93,26 +90,16 @@ class ContactWrenchCone(Term):
 
     name: ClassVar[str] = "contact wrench cone"
     unit: ClassVar[str] = "of weight"
-    friction: float = field(
-        default=0.6,
-        metadata=about("friction coefficient that the plan may use along each axis of the sole", above=0),
+    friction: float = described(
+        0.6, "friction coefficient that the plan may use along each axis of the sole", above=0
     )
-    margin: float = field(
-        default=0.02,
-        metadata=about("least distance from the centre of pressure to the sole's edges", unit="m", least=0),
+    margin: float = described(
+        0.02, "least distance from the centre of pressure to the sole's edges", unit="m", least=0
     )
-    collision_margin: float | None = field(
-        default=0.02,
-        metadata=about(
-            'the same in contact; "anywhere": no constraint',
-            unit="m",
-            least=0,
-            none="anywhere",
-        ),
+    collision_margin: float | None = described(
+        0.02, 'the same in contact; "anywhere": no constraint', unit="m", least=0, none="anywhere"
     )
-    minimum_force: float = field(
-        default=50.0, metadata=about("least normal force of each sole", unit="N", least=0)
-    )
+    minimum_force: float = described(50.0, "least normal force of each sole", unit="N", least=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,27 +108,18 @@ class Balance(Term):
 
     name: ClassVar[str] = "balance after impact"
     unit: ClassVar[str] = "m, m/s, N m s"
-    capture_margin: float | None = field(
-        default=0.02,
-        metadata=about(
-            'margin of the capture point in the support polygon; "anywhere": no constraint',
-            unit="m",
-            least=0,
-            none="anywhere",
-        ),
+    capture_margin: float | None = described(
+        0.02,
+        'margin of the capture point in the support polygon; "anywhere": no constraint',
+        unit="m",
+        least=0,
+        none="anywhere",
     )
-    vertical_speed: float = field(
-        default=0.2,
-        metadata=about("largest vertical speed of the centre of mass", unit="m/s", least=0, endless=True),
+    vertical_speed: float = described(
+        0.2, "largest vertical speed of the centre of mass", unit="m/s", least=0, endless=True
     )
-    angular_momentum: float = field(
-        default=10.0,
-        metadata=about(
-            "largest angular momentum about each axis; inf: any",
-            unit="N m s",
-            least=0,
-            endless=True,
-        ),
+    angular_momentum: float = described(
+        10.0, "largest angular momentum about each axis; inf: any", unit="N m s", least=0, endless=True
     )
 
     def __post_init__(self) -> None:
@@ -159,11 +137,8 @@ class Incidence(Term):
 
     name: ClassVar[str] = "incidence"
     unit: ClassVar[str] = "m/s"
-    speed: float = field(
-        default=0.05,
-        metadata=about(
-            "largest speed along each of two tangents; inf: any", unit="m/s", least=0, endless=True
-        ),
+    speed: float = described(
+        0.05, "largest speed along each of two tangents; inf: any", unit="m/s", least=0, endless=True
     )
 
 
@@ -179,13 +154,8 @@ class LegExtension(Term):
 
     name: ClassVar[str] = "leg extension"
     unit: ClassVar[str] = "of start"
-    minimum: float = field(
-        default=0.35,
-        metadata=about(
-            "least determinant of the leg's Jacobian over that at the start",
-            least=0,
-            most=1,
-        ),
+    minimum: float = described(
+        0.35, "least determinant of the leg's Jacobian over that at the start", least=0, most=1
     )
 
 
@@ -200,8 +170,8 @@ class SelfCollision(Term):
 
     name: ClassVar[str] = "self-collision"
     unit: ClassVar[str] = "m"
-    margin: float = field(default=0.01, metadata=about("least distance between two links", unit="m", least=0))
-    enabled: bool = field(default=True, metadata=about("false: links may pass through each other"))
+    margin: float = described(0.01, "least distance between two links", unit="m", least=0)
+    enabled: bool = described(True, "false: links may pass through each other")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,10 +184,8 @@ class KeepOut(Term):
 
     name: ClassVar[str] = "keep out"
     unit: ClassVar[str] = "m"
-    margin: float = field(
-        default=0.01, metadata=about("least distance from a link to any of them", unit="m", least=0)
-    )
-    enabled: bool = field(default=True, metadata=about("false: the robot may pass through them"))
+    margin: float = described(0.01, "least distance from a link to any of them", unit="m", least=0)
+    enabled: bool = described(True, "false: the robot may pass through them")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,20 +200,11 @@ class GroundForce(Term):
 
     name: ClassVar[str] = "ground force"
     unit: ClassVar[str] = "of weight"
-    least: float = field(
-        default=0.5,
-        metadata=about("least normal force of all soles over the weight", least=0, most=0.9),
-    )
-    most: float = field(
-        default=1.7,
-        metadata=about("largest normal force of all soles over the weight", least=1.1),
-    )
-    sole: float = field(
-        default=0.2,
-        metadata=about("least normal force of each sole over the weight", least=0, most=0.45),
-    )
+    least: float = described(0.5, "least normal force of all soles over the weight", least=0, most=0.9)
+    most: float = described(1.7, "largest normal force of all soles over the weight", least=1.1)
+    sole: float = described(0.2, "least normal force of each sole over the weight", least=0, most=0.45)
 
-    enabled: bool = field(default=True, metadata=about("false: soles may be unloaded, and land hard"))
+    enabled: bool = described(True, "false: soles may be unloaded, and land hard")
 
     def add_constraints(self, program: Any) -> None:
         legs, weight = program.coordinates.legs, weight_of(program.problem.robot)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.robot_bodies import StrikerFace, striker_face
-from impactopt.contact.fields import about
+from impactopt.contact.fields import described
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.terms.hand_orientation import HandOrientation
 from impactopt.problem.violation import degrees, millimetres
 
-Array = NDArray[np.float64]
 # [s] The constraints hold in this time before contact. Earlier, only the striking point stays behind the
 # target's plane.
 SINCE = 0.12
@@ -36,19 +35,12 @@ class FirstTouch(Term):
 
     name: ClassVar[str] = "first touch"
     unit: ClassVar[str] = "m"
-    depth: float = field(
-        default=1.5e-3,
-        metadata=about("largest distance of the link's hull beyond the target's plane", unit="m", above=0),
+    depth: float = described(
+        1.5e-3, "largest distance of the link's hull beyond the target's plane", unit="m", above=0
     )
-    angle: float = field(
-        default=0.6,
-        metadata=about("largest angle between the link's face and the normal", unit="rad", above=0),
-    )
-    assumed: bool = field(
-        default=False,
-        metadata=about("true: of links of unknown shape, too, as boxes of inertia"),
-    )
-    enabled: bool = field(default=True, metadata=about("false: other parts of the link may touch first"))
+    angle: float = described(0.6, "largest angle between the link's face and the normal", unit="rad", above=0)
+    assumed: bool = described(False, "true: of links of unknown shape, too, as boxes of inertia")
+    enabled: bool = described(True, "false: other parts of the link may touch first")
 
     def __post_init__(self) -> None:
         self.check_angle()

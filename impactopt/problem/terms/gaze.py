@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from impactopt.bodies.world import Vector
-from impactopt.contact.fields import about
+from impactopt.contact.fields import about, described
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
@@ -29,11 +29,8 @@ class Gaze(Term):
     unit: ClassVar[str] = "rad"
     frame: str = field(metadata=about("name of the robot's frame"))
     axis: Vector = field(metadata=about("direction of view, in the frame", direction=True))
-    angle: float = field(
-        default=0.5,
-        metadata=about("largest angle of the hit point to the axis", unit="rad", above=0),
-    )
-    since: float = field(default=0.5, metadata=about("share of the swing after which it holds", least=0))
+    angle: float = described(0.5, "largest angle of the hit point to the axis", unit="rad", above=0)
+    since: float = described(0.5, "share of the swing after which it holds", least=0)
 
     def __post_init__(self) -> None:
         self.check_angle()

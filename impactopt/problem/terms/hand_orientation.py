@@ -9,10 +9,10 @@ import casadi as ca
 import numpy as np
 
 from impactopt.bodies.world import Vector
-from impactopt.contact.fields import about
+from impactopt.contact.fields import about, described
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
-from impactopt.problem.terms.base import Term
+from impactopt.problem.terms.base import Term, bound_at_each
 from impactopt.problem.violation import degrees
 
 
@@ -25,12 +25,9 @@ class HandOrientation(Term):
     axis: Vector = field(metadata=about("axis of the hand, in the striker's frame", direction=True))
     direction: Vector | None = field(
         default=None,
-        metadata=about(
-            "its direction at contact, in the world frame; left out: the normal",
-            direction=True,
-        ),
+        metadata=about("its direction at contact, in the world frame; left out: the normal", direction=True),
     )
-    angle: float = field(default=0.2, metadata=about("largest angle between the two", unit="rad", above=0))
+    angle: float = described(0.2, "largest angle between the two", unit="rad", above=0)
 
     def __post_init__(self) -> None:
         self.check_angle()
@@ -42,15 +39,9 @@ class HandOrientation(Term):
     def add_constraints(self, program: Any) -> None:
         direction = program.problem.normal if self.direction is None else self.direction
         numbers = np.array([*self.axis, *direction, np.sin(self.angle)])
-        at = program.add_block("hand_orientation", [[program.contact_state[0]]], numbers)
-        program.constraints.add(
-            term=self.name,
-            place="contact",
-            components=[program.problem.striker],
-            outputs=np.array([at]),
-            lower=1 / np.tan(self.angle),
-            measure=degrees("too far off"),
-        )
+        spots, names = [("contact", [program.contact_state[0]])], [program.problem.striker]
+        bounds: dict[str, Any] = {"lower": 1 / np.tan(self.angle), "measure": degrees("too far off")}
+        bound_at_each(program, self, "hand_orientation", spots, names, numbers, **bounds)
 
 
 def hand_orientation(c: StanceCoordinates, striker: str) -> BlockExpression:

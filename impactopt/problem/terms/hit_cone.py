@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impactopt.bodies.world import face_axes
-from impactopt.contact.fields import about
+from impactopt.contact.fields import described
 from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
-from impactopt.problem.terms.base import Term
+from impactopt.problem.terms.base import Term, bound_at_each
 from impactopt.problem.violation import Measure
 
 TYPICAL = 1.0  # [m/s] speed of a strike, by which the constraint is scaled
@@ -26,9 +26,7 @@ class HitCone(Term):
 
     name: ClassVar[str] = "hit cone"
     unit: ClassVar[str] = "m/s"
-    angle: float = field(
-        default=0.1, metadata=about("largest angle between velocity and normal", unit="rad", above=0)
-    )
+    angle: float = described(0.1, "largest angle between velocity and normal", unit="rad", above=0)
 
     def __post_init__(self) -> None:
         self.check_angle()
@@ -42,15 +40,9 @@ class HitCone(Term):
         # none of these is a parameter that a built program may change
         before = problem.target.speed_before()
         numbers = np.array([*face_axes(problem.normal).ravel(), before, np.tan(self.angle)])
-        at = program.add_block("hit_cone", [[y, y1, program.contact_T]], numbers)
-        program.constraints.add(
-            term=self.name,
-            place="contact",
-            components=["across the normal"],
-            outputs=np.array([at]),
-            lower=0,
-            measure=Measure("m/s", 1.0, "too fast"),
-        )
+        spots, measure = [("contact", [y, y1, program.contact_T])], Measure("m/s", 1.0, "too fast")
+        names = ["across the normal"]
+        bound_at_each(program, self, "hit_cone", spots, names, numbers, lower=0, measure=measure)
 
 
 def hit_cone(c: StanceCoordinates, striker: str) -> BlockExpression:

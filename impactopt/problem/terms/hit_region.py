@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impactopt.bodies.world import face_axes
-from impactopt.contact.fields import about
+from impactopt.contact.fields import described
 from impactopt.errors import InputError, check_array
 from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
@@ -29,10 +29,8 @@ class HitRegion(Term):
 
     name: ClassVar[str] = "hit region"
     unit: ClassVar[str] = "m"
-    radius: float | None = field(default=None, metadata=about("radius of the disc", unit="m", above=0))
-    size: tuple[float, float] | None = field(
-        default=None, metadata=about("sides of the rectangle, across and up", unit="m")
-    )
+    radius: float | None = described(None, "radius of the disc", unit="m", above=0)
+    size: tuple[float, float] | None = described(None, "sides of the rectangle, across and up", unit="m")
 
     def __post_init__(self) -> None:
         if (self.radius is None) == (self.size is None):

@@ -7,13 +7,13 @@ from the start if the problem gives the term (`impactopt.planning.lazy_constrain
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
-from impactopt.contact.fields import about
+from impactopt.contact.fields import described
 from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
 from impactopt.kinematics.operational_space import across
 from impactopt.problem.block import BlockExpression, BlockRecipe, joint_motion, make_block
@@ -39,16 +39,13 @@ class GearLoad(Term):
     needs_torques: ClassVar[bool] = True
     first_instant: ClassVar[bool] = True
     of_drives: ClassVar[bool] = True
-    limit: float | Mapping[str, float] | None = field(
-        default=None,
-        metadata=about(
-            "largest load over the torque limit, of all or by joint; left out: the gear's "
-            "momentary peak, or 2",
-            above=0,
-            by_joint=True,
-        ),
+    limit: float | Mapping[str, float] | None = described(
+        None,
+        "largest load over the torque limit, of all or by joint; left out: the gear's momentary peak, or 2",
+        above=0,
+        by_joint=True,
     )
-    enabled: bool = field(default=True, metadata=about("false: gear loads are not bounded"))
+    enabled: bool = described(True, "false: gear loads are not bounded")
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"rotors": BlockRecipe(lambda: rotors(coordinates))}
@@ -109,8 +106,8 @@ class Slide(Term):
 
     name: ClassVar[str] = "slide"
     unit: ClassVar[str] = "m"
-    most: float = field(default=0.1, metadata=about("largest offset along each tangent", unit="m", above=0))
-    enabled: bool = field(default=True, metadata=about("false: the offset is not bounded"))
+    most: float = described(0.1, "largest offset along each tangent", unit="m", above=0)
+    enabled: bool = described(True, "false: the offset is not bounded")
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"slide": BlockRecipe(lambda: slide(coordinates, problem.striker))}
@@ -152,10 +149,8 @@ class ReferenceRange(Term):
 
     name: ClassVar[str] = "reference range"
     unit: ClassVar[str] = "rad"
-    margin: float = field(
-        default=0.0, metadata=about("distance from each limit as contact ends", unit="rad", least=0)
-    )
-    enabled: bool = field(default=True, metadata=about("false: the reference is not bounded"))
+    margin: float = described(0.0, "distance from each limit as contact ends", unit="rad", least=0)
+    enabled: bool = described(True, "false: the reference is not bounded")
 
     def limits(self, robot: Any) -> tuple[Any, Any]:
         """Least and largest angles (n,) of the reference [rad], infinite for joints without a motor."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
-from impactopt.contact.fields import about
+from impactopt.contact.fields import described
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, joint_motion, make_block
@@ -29,7 +29,7 @@ class MotorCurve(Term):
     unit: ClassVar[str] = "of the line"
     needs_torques: ClassVar[bool] = True
     of_drives: ClassVar[bool] = True
-    fraction: float = field(default=1.0, metadata=about("share of the line", above=0, most=1))
+    fraction: float = described(1.0, "share of the line", above=0, most=1)
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"motor_speed": BlockRecipe(lambda: motor_speed(coordinates))}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
-from impactopt.contact.fields import about
+from impactopt.contact.fields import described
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.block import BlockExpression, BlockRecipe, joint_motion, make_block
 from impactopt.problem.terms.base import Term, of_joints
@@ -34,14 +34,12 @@ class PowerLimit(Term):
     unit: ClassVar[str] = "of limit"
     needs_torques: ClassVar[bool] = True
     of_drives: ClassVar[bool] = True
-    limit: float | Mapping[str, float] | None = field(
-        default=None,
-        metadata=about(
-            "largest power, of all or by joint; left out: that of `[[robot.actuators]]`",
-            unit="W",
-            above=0,
-            by_joint=True,
-        ),
+    limit: float | Mapping[str, float] | None = described(
+        None,
+        "largest power, of all or by joint; left out: that of `[[robot.actuators]]`",
+        unit="W",
+        above=0,
+        by_joint=True,
     )
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:

@@ -12,7 +12,7 @@ from impactopt.contact.fields import about
 from impactopt.contact.targets.base import Target
 from impactopt.errors import InputError
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
-from impactopt.problem.terms.base import Term
+from impactopt.problem.terms.base import Term, bound_at_each
 from impactopt.problem.violation import Measure
 
 
@@ -46,19 +46,14 @@ class TargetSpeed(Term):
         def numbers(target: Target) -> Any:
             return np.array(list(target.parameters.values()))
 
-        at = program.add_block(
-            "target_speed", [[program.expected.target_state]], numbers(program.problem.target)
-        )
+        spots, own = [("separation", [program.expected.target_state])], numbers(program.problem.target)
+        bounds: dict[str, Any] = {
+            "lower": self.least,
+            "upper": self.most,
+            "measure": Measure("m/s", 1.0, "off"),
+        }
+        bound_at_each(program, self, "target_speed", spots, ["normal"], own, **bounds)
         program.builder.follow(lambda b: b.block("target_speed").take_parameters(numbers(b.problem.target)))
-        program.constraints.add(
-            term=self.name,
-            place="separation",
-            components=["normal"],
-            outputs=np.array([at]),
-            lower=self.least,
-            upper=self.most,
-            measure=Measure("m/s", 1.0, "off"),
-        )
 
 
 def speed(target: Target) -> BlockExpression:

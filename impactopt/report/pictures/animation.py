@@ -13,15 +13,15 @@ import pinocchio as pin
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 from PIL import Image, ImageColor
 from scipy.spatial import ConvexHull
 
+from impactopt.arrays import Array, Index
 from impactopt.bodies.visuals import surroundings_of
 from impactopt.files.output import check_ending, write_file
 from impactopt.files.replay import Replay
 from impactopt.kinematics.stance import corners_at
-from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION, Array
+from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION
 from impactopt.robots.loads import MIN_LOAD_FRACTION, weight_of
 from impactopt.simulation import scene_of
 from impactopt.simulation.reference.poses import bones
@@ -269,7 +269,7 @@ def _gif(pictures: list[Image.Image]) -> bytes:
     return memory.getvalue()
 
 
-def shown_times(start: float, end: float, last: float) -> tuple[Array, NDArray[np.intp]]:
+def shown_times(start: float, end: float, last: float) -> tuple[Array, Index]:
     """Instants (k,) [s] of the frames until `last`, and the factor by which time is slower at each."""
     times, paces, t = [], [], 0.0
     while t <= last:

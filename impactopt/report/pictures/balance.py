@@ -12,8 +12,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import FigureBase
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Index
 from impactopt.files.record import Record
 from impactopt.kinematics.stance import zmp
 from impactopt.report.histories import footprints
@@ -24,7 +24,6 @@ from impactopt.report.pictures.style import (
     OVER,
     PHASES,
     RIGHT,
-    Array,
     picture,
     simulated_parts,
 )
@@ -115,7 +114,7 @@ def _span(time: Array, phase: int) -> tuple[float, float]:
     return (0.0, float(time[-1])) if phase == 1 else (float(time[0]), float(time[-1]))
 
 
-def _stations(time: Array, count: int) -> NDArray[np.intp]:
+def _stations(time: Array, count: int) -> Index:
     """Indices of about evenly spaced instants."""
     return np.searchsorted(time, np.linspace(time[0], time[-1], count)).clip(0, len(time) - 1)
 

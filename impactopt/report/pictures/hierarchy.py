@@ -9,9 +9,10 @@ import numpy as np
 from matplotlib.lines import Line2D
 from scipy.integrate import cumulative_trapezoid
 
+from impactopt.arrays import Array
 from impactopt.collision import Collision
 from impactopt.errors import InputError
-from impactopt.report.pictures.style import MODELS, PAGE, Array, Picture, styled
+from impactopt.report.pictures.style import MODELS, PAGE, Picture, styled
 
 # from the coarsest model to the finest: virtual mass, the paper's SDC, ours, and ours frozen again in shades
 # of one colour

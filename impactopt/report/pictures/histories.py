@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.lines import Line2D
 
+from impactopt.arrays import Array
 from impactopt.files.record import Record
 from impactopt.report.histories import contact_force
 from impactopt.report.pictures.style import (
@@ -23,7 +24,6 @@ from impactopt.report.pictures.style import (
     PLANNED,
     SIMULATED,
     VERMILION,
-    Array,
     impulse_text,
     joint_label,
     picture,

@@ -11,19 +11,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 from scipy.spatial import ConvexHull
 
+from impactopt.arrays import Array
 from impactopt.files.record import Record
-from impactopt.report.pictures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    PAGE,
-    RIGHT,
-    SKY,
-    VERMILION,
-    Array,
-    picture,
-    title,
-)
+from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PAGE, RIGHT, SKY, VERMILION, picture, title
 
 GAP = 0.12  # [m] between poses
 GREY = "#999999"

@@ -9,12 +9,13 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from impactopt.arrays import Array
 from impactopt.bodies.solids import Solid, simplified
 from impactopt.bodies.visuals import LARGE, Part, surroundings_of
 from impactopt.files.record import Record
 from impactopt.problem.motion_style import joints_to
 from impactopt.problem.problem import ImpactProblem
-from impactopt.report.pictures.style import BLUE, ORANGE, VERMILION, Array, Picture, styled, title
+from impactopt.report.pictures.style import BLUE, ORANGE, VERMILION, Picture, styled, title
 from impactopt.report.stage import bodies_drawn
 from impactopt.report.tracks import Track, tracks_of
 

@@ -14,11 +14,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.rcsetup import cycler
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.files.record import Record
 
-Array = NDArray[np.float64]
 Given = ParamSpec("Given")
 Drawn = TypeVar("Drawn")
 

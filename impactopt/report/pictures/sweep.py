@@ -12,8 +12,8 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Index
 from impactopt.errors import InputError
 from impactopt.files.output import write_file
 from impactopt.report.pictures.style import BLACK, COLOURS, PAGE, Picture, model_colour, styled
@@ -27,8 +27,6 @@ from impactopt.report.pictures.sweep_columns import (
 from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.sections import Figure as Section
 from impactopt.sweeps.table import read_columns, read_units
-
-Array = NDArray[np.float64]
 
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
 NO_RESULT = "#d9d9d9"  # colour of cases without a result
@@ -205,9 +203,7 @@ def _shaded(section: Section, data: SweepColumns) -> bool:
     return len(section.colour) == 1 and data.is_numeric(section.colour[0])
 
 
-def _shades(
-    section: Section, data: SweepColumns, groups: NDArray[np.intp], names: Sequence[str]
-) -> list[Any]:
+def _shades(section: Section, data: SweepColumns, groups: Index, names: Sequence[str]) -> list[Any]:
     """Colours of the groups: shades of one scale for numbers, else distinct ones; models have their own."""
     if MODEL in section.colour:
         again = data.numbers(FREEZES) if FREEZES in section.colour else np.zeros(len(groups))

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Index
 from impactopt.errors import InputError
 from impactopt.report.pictures.style import joint_label
 from impactopt.sweeps.sections import Figure as Section
 from impactopt.sweeps.table import unit_of, without_unit
 
-Array = NDArray[np.float64]
 Columns = Mapping[str, Sequence[Any] | NDArray[Any]]
 
 
@@ -116,7 +116,7 @@ def errors_against(section: Section, data: SweepColumns, values: Array) -> Array
     return np.abs(error) if "y" in section.log else error
 
 
-def combined(names: Sequence[str], data: SweepColumns) -> tuple[NDArray[np.intp], list[str]]:
+def combined(names: Sequence[str], data: SweepColumns) -> tuple[Index, list[str]]:
     """Number of each case's combination of the columns' values, and names of the combinations."""
     if not names:
         return np.zeros(len(data.values(data.section.x)), dtype=np.intp), [""]

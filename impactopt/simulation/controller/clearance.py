@@ -7,12 +7,11 @@ from typing import Any
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Index
 from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids
 from impactopt.simulation.result import cross
 
-Array = NDArray[np.float64]
 MIN_DISTANCE = 2e-3  # [m]: plans keep more, but for half a millimetre between their nodes
 BANDWIDTH = 40.0  # [rad/s] of the barrier: a tenth of what 1 kHz and a millisecond of delay follow
 # [m/s^2] largest closing acceleration of two bodies before their distance is computed again
@@ -116,7 +115,7 @@ class Clearance:
         self._last = rotation, translation
         return origins
 
-    def _distances(self, data: Any, pairs: NDArray[np.intp]) -> list[Any]:
+    def _distances(self, data: Any, pairs: Index) -> list[Any]:
         """Results of coal for pairs (k, 2) of solids."""
         placements = {}
         for k in map(int, np.unique(pairs)):
@@ -130,7 +129,7 @@ class Clearance:
         return results
 
 
-def _of_points(data: Any, joints: NDArray[np.intp], arms: Array) -> tuple[Array, Array]:
+def _of_points(data: Any, joints: Index, arms: Array) -> tuple[Array, Array]:
     """Velocities and accelerations (k, 2, 3) of points fixed to joints (k, 2), in world axes.
 
     arms (k, 2, 3) : from the joints' origins to the points, in world axes.

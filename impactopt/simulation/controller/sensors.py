@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 # standard deviations, at noise = 1
 ENCODER = 2 * np.pi / 2**19 / np.sqrt(12)  # [rad] quantization: uniform over one count
 TILT = np.deg2rad(0.2)  # [rad] of roll and pitch, constant during a replay

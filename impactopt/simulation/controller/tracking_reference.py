@@ -13,14 +13,12 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.robots.checks import columns_above
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.result import Scene, distance_inside, stance_at, stance_begins
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ import numpy as np
 import osqp
 import pinocchio as pin
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.clearance import MAX_CONSTRAINTS, Clearance
 from impactopt.simulation.controller.sensors import Sensors, StateEstimate
@@ -28,7 +28,6 @@ from impactopt.simulation.motors import Servo
 from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.result import Scene, stance_at, stance_begins
 
-Array = NDArray[np.float64]
 ADMM_PENALTY = 1.0  # OSQP's rho: after the change of variables the Hessian is the identity
 OSQP_INFINITY = 1e30
 MIN_NORM = 1e-12  # avoids a division by zero for a constraint without coefficients
@@ -146,7 +145,7 @@ class TorqueResponse(DenseBody):
         self.B, self.b0 = solved[nv:, :n], constant[nv:]
         self.stabilizing_wrenches = solved[nv:, n + 1]
 
-    def fix_torques(self, which: NDArray[np.bool_], torque: Array) -> None:
+    def fix_torques(self, which: Mask, torque: Array) -> None:
         """Moves the torques (n,) [N m] of some joints, as of springs, from the unknowns to a0 and b0."""
         fixed = np.where(which, torque, 0.0)
         self.a0, self.b0 = self.a0 + self.A @ fixed, self.b0 + self.B @ fixed
@@ -264,7 +263,7 @@ class StanceProblem:
     """
 
     def __init__(
-        self, robot: Robot, scene: Scene, standing: NDArray[np.intp], settings: ControllerSettings, q0: Array
+        self, robot: Robot, scene: Scene, standing: Index, settings: ControllerSettings, q0: Array
     ) -> None:
         """standing : indices of the scene's soles that stand.  q0 (nq,) : configuration with them placed."""
         self.frames = tuple(scene.soles[k] for k in standing)

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array, Mask
 from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.collision.settings import Effects, JointFriction, Settings, constant_reference, servo_settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.contact.friction import check_friction, tangential_mobility
 from impactopt.errors import InputError, check_array, check_kind, check_positive
 from impactopt.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class Phase(NamedTuple):
@@ -66,7 +65,7 @@ class Forces:
     transition: float
     feedforward: Array
     velocity: Array
-    sprung: NDArray[np.bool_]
+    sprung: Mask
     reference: Array
     reference_until: float
     mobility: float

@@ -18,17 +18,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.integrate import DOP853
 from scipy.optimize import brentq, minimize_scalar
 
+from impactopt.arrays import Array
 from impactopt.collision.interface import Collision
 from impactopt.contact.friction import UNBENT
 from impactopt.errors import InputError
 from impactopt.simulation.pinocchio_robot import Body
 from impactopt.simulation.reference.base import Forces, Phase
 
-Array = NDArray[np.float64]
 _OVERSHOOT = 1e-10  # fraction of a step beyond its event, so that the next step starts in the new phase
 # fractions of a step at which events are looked for; an oscillation turns by less than a radian in a step
 _EVENT_SAMPLES = (0.25, 0.5, 0.75, 1.0)

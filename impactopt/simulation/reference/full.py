@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.collision.interface import Collision
 from impactopt.errors import check_choice
 from impactopt.simulation.pinocchio_robot import FORMS
 from impactopt.simulation.reference.base import Forces, ReferenceModel, converge
 from impactopt.simulation.reference.equations_of_motion import Motion, Run, collision_from
 
-Array = NDArray[np.float64]
 # Tolerance of a step: fraction of the impulse's tolerance in the first run, and factor from run to run
 _STEP_FRACTION, _FACTOR = 1e-3, 1e-2
 _MIN_TOLERANCE = 3e-14  # of a step; below, rounding errors are larger

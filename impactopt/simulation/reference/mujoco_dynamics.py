@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.collision.interface import Collision
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
@@ -26,7 +26,6 @@ from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.reference.base import Forces, Phase, ReferenceModel, converge
 from impactopt.simulation.reference.equations_of_motion import Instant, Scales, collision_from, contact_scales
 
-Array = NDArray[np.float64]
 _RECORD = 5e-5  # [s] between recorded instants
 _RESOLUTION = 0.02  # step of the first run, times the contact's fastest rate
 _RUNS, _MAX_STEPS = 9, 300_000  # with half the step each; of a run

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Mask
 from impactopt.bodies.world import WorldBody
 from impactopt.kinematics.operational_space import ConstrainedDynamics, striking_point
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
 
-Array = NDArray[np.float64]
 POSES_BEFORE, POSES_AFTER = 4, 2  # up to contact, and after the end of contact
 
 
@@ -36,7 +35,7 @@ class Poses:
 
     time: Array
     links: Array
-    strikes: NDArray[np.bool_]
+    strikes: Mask
     contact: int
     path: Array
     target: Array

@@ -44,8 +44,8 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site as `make docs` builds it, but without garbage collection, a quarter of its time; warnings, such
-    as of a link that leads nowhere, are errors.
+    """The site as `make docs` builds it, but without garbage collection, a quarter of its time; warnings are
+    errors, as a link that leads nowhere is.
     """
     out = tmp_path_factory.mktemp("site")
     build = "import gc, sys; gc.disable(); from sphinx.cmd.build import main; sys.exit(main(sys.argv[1:]))"

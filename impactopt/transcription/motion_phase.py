@@ -7,6 +7,7 @@ and after these (`impactopt.transcription.stance_change`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -144,12 +145,13 @@ def _outside_cone(facet: Array, normal: Affine, friction: float) -> Measure:
     A facet without shear and torsion bounds the centre of pressure, one without moments of tilting and
     torsion the friction; the others combine these.
     """
-    shear, tilting = np.hypot(*facet[:2]), np.hypot(*facet[3:5])
-    if shear < 1e-9 and abs(facet[5]) < 1e-9:
+    x, y, z, roll, pitch, yaw = facet.tolist()
+    shear, tilting = math.hypot(x, y), math.hypot(roll, pitch)
+    if shear < 1e-9 and abs(yaw) < 1e-9:
         return Measure("mm", 1e3 / tilting, "outside", normal, 0.05)  # moment over normal force
-    if tilting < 1e-9 and abs(facet[5]) < 1e-9:
+    if tilting < 1e-9 and abs(yaw) < 1e-9:
         return Measure("%", 100 / shear / friction, "beyond its friction", normal, 0.05)
-    return Measure("%", 100 / max(facet[2], 1e-3), "beyond its friction and torsion", normal, 0.05)
+    return Measure("%", 100 / max(z, 1e-3), "beyond its friction and torsion", normal, 0.05)
 
 
 # End conditions of a spline: zero velocity and acceleration; none; zero acceleration.

@@ -188,6 +188,7 @@ class Group:
     scale: Array  # (size,)
     labels: tuple[str, ...]
     measures: tuple[Measure, ...] = ()
+    _members: dict[int, Affine] = field(default_factory=dict, repr=False, compare=False)
 
     def index(self, k: int) -> NDArray[np.intp]:
         if not -self.count <= k < self.count:
@@ -196,7 +197,10 @@ class Group:
         return np.arange(first, first + self.size)
 
     def __getitem__(self, k: int) -> Affine:
-        return Affine(self.size, np.arange(self.size), self.index(k), self.scale.copy(), np.zeros(self.size))
+        if k not in self._members:  # many constraints use the same ones
+            rows, index = np.arange(self.size), self.index(k)
+            self._members[k] = Affine(self.size, rows, index, self.scale, np.zeros(self.size))
+        return self._members[k]
 
     def read(self, x: Array) -> Array:
         """Physical values, shape (count, size)."""

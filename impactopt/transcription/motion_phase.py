@@ -212,6 +212,7 @@ class MotionPhase:
         self.nodes = np.union1d(regular[1:] if begins == REST else regular, more)
         self._begins, self._ends = begins, ends
         self._at: dict[float, tuple[Affine, Affine, Affine]] = {}
+        self._controls: dict[int, Affine] = {}
         self.unloaded: dict[int, Index] = {}
         self._last = len(self.breaks) + 1
         self._y0 = Affine.constant(b.y0)
@@ -245,10 +246,12 @@ class MotionPhase:
         torque that the swing ends with as feed-forward. So the torque does not jump at contact, and a target
         that comes late meets the same motion.
         """
-        point = self._control(j)
-        if self.drift is None or j not in self._drifting:
-            return point
-        return stack([self.drift[self._drifting.index(j)], point[6:]])
+        if j not in self._controls:
+            point = self._control(j)
+            if self.drift is not None and j in self._drifting:
+                point = stack([self.drift[self._drifting.index(j)], point[6:]])
+            self._controls[j] = point
+        return self._controls[j]
 
     def _control(self, j: int) -> Affine:
         if j < self.lead:

@@ -17,18 +17,11 @@ from impactopt.transcription.transcription import Transcription
 os.environ.setdefault("IMPACTOPT_COMPILE", "quick")  # `as_shipped` takes it away
 
 
-LONGEST = "test_docs_site.py"
-
-
 def pytest_configure(config: pytest.Config) -> None:
     """Workers get files in the order of collection. By the number of their tests, as xdist has it, a long
     file of few tests would be among the last, and the other workers would wait for it.
     """
     config.option.loadscopereorder = False
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: item.path.name != LONGEST)
 
 
 def pytest_collection_finish() -> None:

@@ -42,27 +42,17 @@ class Page(HTMLParser):
             self.links.append(leads)
 
 
-def built(out: Path, *options: str) -> Path:
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The site as `make docs` builds it, but without garbage collection, a quarter of its time; warnings are
-    errors.
+    errors, as a link that leads nowhere is.
     """
+    out = tmp_path_factory.mktemp("site")
     build = "import gc, sys; gc.disable(); from sphinx.cmd.build import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", build, "-W", "--keep-going", "-q", *options, str(DOCS), str(out)]
+    command = [sys.executable, "-c", build, "-W", "--keep-going", "-q", str(DOCS), str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=out)
     assert done.returncode == 0, done.stderr[-4000:]
     return out
-
-
-def test_the_documentation_builds_without_a_warning(tmp_path: Path) -> None:
-    """All pages are read and all references resolved; their HTML is of the slow tests. What the theme and our
-    extensions make of a page changes seldom, and a link that leads nowhere is a warning too.
-    """
-    built(tmp_path, "-b", "dummy", "-D", "smartquotes=0")  # a tenth of the time, and no matter of warnings
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return built(tmp_path_factory.mktemp("site"))
 
 
 @pytest.fixture(scope="module")

@@ -268,7 +268,8 @@ def _settings(model: SteppedModel, settings: Mapping[str, Any], count: int) -> d
             # The range of a number is an interval: least and largest suffice. Directions and matrices are
             # checked one by one.
             whole = name == "normal" or (name in ("kp", "kd") and default.ndim == 2)
-            extremes = np.unique([value.min(axis=0), value.max(axis=0)], axis=0)
+            least, largest = value.min(axis=0), value.max(axis=0)
+            extremes = [least] if np.array_equal(least, largest) else [least, largest]
             for one in value if whole else extremes:
                 model.settings.override({name: one})
             capped = np.minimum(value, NO_LIMIT) if name == "torque_limit" else value

@@ -175,13 +175,13 @@ def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:
 def base_rates(y: Array, v: Array) -> Array:
     """ydot (6,) of the base from a Pinocchio velocity v (nv,); inverts `base_motion`."""
     jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
-    return np.append(pin.rpy.rpyToMatrix(y[3:6]) @ v[:3], solved(jac, v[3:6]))
+    return np.concatenate([pin.rpy.rpyToMatrix(y[3:6]) @ v[:3], solved(jac, v[3:6])])
 
 
 def independent_rates(c: StanceCoordinates, y: Array, v: Array) -> Array:
     """ydot (ny,) from a Pinocchio velocity v (nv,)."""
     own = v[c.base + c.independent]
-    return np.append(base_rates(y, v), own) if c.base else own
+    return np.concatenate([base_rates(y, v), own]) if c.base else own
 
 
 def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:

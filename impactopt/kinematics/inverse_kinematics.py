@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from impactopt.errors import InputError
-from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.coordinates import StanceCoordinates, solved
 from impactopt.kinematics.operational_space import across
 from impactopt.kinematics.stance import inward_edges, margin
 from impactopt.robots.robot import Robot
@@ -159,11 +159,13 @@ def _searched(
     data = model.createData()
     aims = [(striker, point), *also]
     hands = [(model.getFrameId(f"striker:{name}"), point) for name, point in aims]
+    soles = [(model.getFrameId(leg.frame), leg.placement) for leg in coordinates.legs]
     lower, upper = inside(robot, margin)
     # a continuous joint has (cos, sin) of its angle in q, and no limits
     joints = robot.joint_models
     limited = np.array([k for k, j in enumerate(joints) if j.nq == 1], dtype=np.intp)
     place = np.array([joints[k].idx_q for k in limited], dtype=np.intp)
+    lower, upper = lower[limited], upper[limited]
     # A fixed seed: the same problem has the same posture.
     rng = np.random.default_rng(0)
     base = coordinates.base
@@ -180,13 +182,12 @@ def _searched(
             q = pin.integrate(model, q, np.concatenate([np.zeros(base), offsets]))
         step = np.full(model.nv, np.inf)
         for iteration in range(200):
-            q[place] = np.clip(q[place], lower[limited], upper[limited])
+            q[place] = np.minimum(np.maximum(q[place], lower), upper)
             pin.computeJointJacobians(model, data, q)
             pin.updateFramePlacements(model, data)
             errors, jacs = [], []
-            for leg in coordinates.legs:
-                f = model.getFrameId(leg.frame)
-                errors.append(pin.log6(data.oMf[f].actInv(leg.placement)).vector)
+            for f, placement in soles:
+                errors.append(pin.log6(data.oMf[f].actInv(placement)).vector)
                 jacs.append(pin.getFrameJacobian(model, data, f, pin.LOCAL))
             for fid, point in reversed(hands):
                 errors.append(point - data.oMf[fid].translation)
@@ -194,13 +195,13 @@ def _searched(
                 hand = np.reshape(hand, (6, model.nv))  # Pinocchio drops an axis if nv is 1
                 jacs.append(hand[:3])
             off = float(np.abs(np.concatenate(errors)).max())
-            gap = max(float(np.linalg.norm(error)) for error in errors)
+            gap = max(float(error @ error) for error in errors) ** 0.5
             if gap < best_gap:
                 best_gap, nearest = gap, [data.oMf[fid].translation.copy() for fid, _ in hands]
             orienting = facing is not None and iteration < FACING_STEPS
             if off < tolerance and (not orienting or np.abs(step).max() < FACING_STEP):
                 return q
-            damping = np.full(6 * len(coordinates.legs) + 3 * len(hands), 1e-8)
+            damping = np.full(6 * len(soles) + 3 * len(hands), 1e-8)
             if facing is not None and orienting:  # fid, hand: of the striker, the last in the loop above
                 axis = data.oMf[fid].rotation @ facing[0]
                 sides = across(axis)  # two components: a rotation about the axis changes nothing
@@ -212,23 +213,24 @@ def _searched(
             # again.
             step = np.zeros(model.nv)
             free = np.ones(model.nv, dtype=bool)
+            high, low = q[place] >= upper - 1e-9, q[place] <= lower + 1e-9
             for _ in range(3):
                 j = jac[:, free]
                 step[:] = 0.0
                 # Weighted damped least squares in the small space, W J' (J W J' + D)^-1 e: a system of
                 # as many unknowns as errors.
                 jw = j * ease[free]
-                step[free] = jw.T @ np.linalg.solve(jw @ j.T + np.diag(damping), e)
+                square = jw @ j.T
+                square.flat[:: len(e) + 1] += damping
+                step[free] = jw.T @ solved(square, e)
                 joint = step[base:][limited]
                 violates = np.zeros(robot.n, dtype=bool)
-                violates[limited] = ((q[place] >= upper[limited] - 1e-9) & (joint > 0)) | (
-                    (q[place] <= lower[limited] + 1e-9) & (joint < 0)
-                )
+                violates[limited] = (high & (joint > 0)) | (low & (joint < 0))
                 if not (violates & free[base:]).any():
                     break
                 free[base:] &= ~violates
             # Linearization is good for some tenths of a radian.
-            q = pin.integrate(model, q, np.clip(step, -0.15, 0.15))
+            q = pin.integrate(model, q, np.minimum(np.maximum(step, -0.15), 0.15))
     pin.framesForwardKinematics(model, data, guess)
     start = [data.oMf[fid].translation for fid, _ in hands]
     names = " and ".join(f"'{name}'" for name, _ in aims)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import version
 from typing import Any
 
@@ -474,10 +474,14 @@ def impact_summary(
     }
 
 
+_version = cache(version)  # reads a file each time
+
+
 def versions() -> dict[str, str]:
     """Versions of the packages that computed the results."""
     names = ("casadi", "pin", "numpy", "scipy", "osqp")
-    return {"impactopt": __version__, "python": platform.python_version(), **{n: version(n) for n in names}}
+    found = {name: _version(name) for name in names}
+    return {"impactopt": __version__, "python": platform.python_version(), **found}
 
 
 def program_on(

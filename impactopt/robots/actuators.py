@@ -120,10 +120,11 @@ def with_classes(
 
 def known(actuators: Iterable[Actuator]) -> tuple[Actuator, ...]:
     """The actuators, with friction and springs that are not known set to zero."""
-    return tuple(
-        replace(actuator, **{name: 0.0 for name in _FIELDS_OF_JOINT if getattr(actuator, name) is None})
-        for actuator in actuators
-    )
+    out = []
+    for actuator in actuators:
+        missing = {name: 0.0 for name in _FIELDS_OF_JOINT if getattr(actuator, name) is None}
+        out.append(replace(actuator, **missing) if missing else actuator)
+    return tuple(out)
 
 
 def fitting(pattern: str, joints: Sequence[str], where: str) -> list[int]:

@@ -31,7 +31,7 @@ class JointAngles:
 
     def of(self, q: Array) -> Array:
         """Angles (..., n) of configurations (..., nq); those of continuous joints in [-pi, pi]."""
-        angles = np.array(q[..., self._place])
+        angles = q.take(self._place, axis=-1)
         for k in self.continuous:
             at = self._place[k]
             angles[..., k] = np.arctan2(q[..., at + 1], q[..., at])

@@ -7,7 +7,6 @@ example-robot-data (extra `robots`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import wraps
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -40,7 +39,10 @@ def _preset(make: Callable[P, Robot]) -> Callable[P, Robot]:
 
     @wraps(make)
     def made(*args: P.args, **overrides: P.kwargs) -> Robot:
-        return replace(make(*args, **overrides), source=Source(preset=make.__name__, options=overrides))
+        robot = make(*args, **overrides)
+        # not `replace`, which would check a new robot again
+        object.__setattr__(robot, "source", Source(preset=make.__name__, options=overrides))
+        return robot
 
     return made
 

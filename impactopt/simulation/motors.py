@@ -61,7 +61,6 @@ class Servo:
         if self.continuous.size:  # the shorter way round
             error[self.continuous] = np.remainder(error[self.continuous] + np.pi, 2 * np.pi) - np.pi
         demand = target[2 * n :] + self.kp * error + self.kd * (target[n : 2 * n] - rates)
-        # not np.clip, which takes three times as long
         return demand, np.minimum(np.maximum(demand, -self.limit), self.limit)
 
 
@@ -147,7 +146,8 @@ class Motors:
             return torque
         # back-EMF and viscous friction, linear in the rate, and dry friction
         lost = self._slope * rates + self._coulomb * np.sign(rates)
-        return np.clip(torque, -self._stall - lost, self._stall - lost)
+        # not np.clip, which takes three times as long
+        return np.minimum(np.maximum(torque, -self._stall - lost), self._stall - lost)
 
     def now(self, torque: Array, wanted: Array) -> Array:
         """Present torque (n,) [N m]: `wanted` of motors without inductance, `torque` of the others."""

@@ -41,6 +41,7 @@ from impactopt.transcription.layout import (
     Group,
     Index,
     Turn,
+    add,
     along,
     by_leg,
     determined,
@@ -502,12 +503,10 @@ class Collision(ContactParameters):
         s = self.stages[i]
         # Slope of the polynomial through the element's beginning and its stages, by the inverse of Radau's A:
         # `weights` of the stages' values, weight `start` of the beginning's.
-        slope = Affine.zeros(group.size)
-        for m, w in zip(s.members, s.weights, strict=True):
-            slope = slope + group[m] * w
         begins = s.previous < 0 or (each_phase and s.new_phase)
         before = start if begins else group[s.previous]
-        return group[i], slope + before * s.start
+        of_stages = [group[m] * w for m, w in zip(s.members, s.weights, strict=True)]
+        return group[i], add([*of_stages, before * s.start])
 
     def _place(self, s: CollocationPoint) -> Place:
         # a scenario's name may have braces, and the text is a format for the time

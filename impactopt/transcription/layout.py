@@ -15,9 +15,9 @@ several.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -73,17 +73,20 @@ class Affine:
         return cls(len(const), rows, cols, np.asarray(entries.data), np.asarray(const))
 
     def __add__(self, other: Affine | ArrayLike) -> Affine:
-        if not isinstance(other, Affine):
-            other = Affine.constant(np.zeros(self.size) + np.asarray(other, dtype=float))
-        return add([self, other])
+        if isinstance(other, Affine):
+            return add([self, other])
+        const = (self.const + np.asarray(other, dtype=float)).ravel()
+        _check_sizes([self.size, const.size])
+        return Affine(self.size, self.rows, self.cols, self.vals, const)
 
     __radd__ = __add__  # `sum` begins at 0
 
     def __mul__(self, factor: ArrayLike) -> Affine:
         if isinstance(factor, Affine):
             raise InputError("a product of affine expressions is not affine: `lift` the output of a block")
-        k = np.asarray(factor, dtype=float) + np.zeros(self.size)
-        return Affine(self.size, self.rows, self.cols, self.vals * k[self.rows], self.const * k)
+        k = np.asarray(factor, dtype=float)
+        by_row = k if k.ndim == 0 else np.broadcast_to(k, self.const.shape)[self.rows]
+        return Affine(self.size, self.rows, self.cols, self.vals * by_row, self.const * k)
 
     __rmul__ = __mul__
 
@@ -139,15 +142,21 @@ def select(expression: Affine, keep: NDArray[np.intp]) -> Affine:
 
 def add(parts: Sequence[Affine]) -> Affine:
     """Sum of one or more expressions of the same size."""
-    if len(sizes := dict.fromkeys(p.size for p in parts)) > 1:
-        raise ValueError(f"affine expressions of sizes {' and '.join(map(str, sizes))} do not add")
+    _check_sizes([p.size for p in parts])
     return Affine(
         parts[0].size,
         np.concatenate([p.rows for p in parts]),
         np.concatenate([p.cols for p in parts]),
         np.concatenate([p.vals for p in parts]),
-        np.sum([p.const for p in parts], axis=0),
+        np.asarray(sum(p.const for p in parts)),
     )
+
+
+def _check_sizes(sizes: Sequence[int]) -> None:
+    if len(set(sizes)) > 1:
+        raise ValueError(
+            f"affine expressions of sizes {' and '.join(map(str, dict.fromkeys(sizes)))} do not add"
+        )
 
 
 def stack(parts: Sequence[Affine]) -> Affine:
@@ -179,14 +188,19 @@ class Group:
     scale: Array  # (size,)
     labels: tuple[str, ...]
     measures: tuple[Measure, ...] = ()
+    _members: dict[int, Affine] = field(default_factory=dict, repr=False, compare=False)
 
     def index(self, k: int) -> NDArray[np.intp]:
         if not -self.count <= k < self.count:
             raise IndexError(f"{self.name} has {self.count} members, not {k}")
-        return self.offset + (k % self.count) * self.size + np.arange(self.size)
+        first = self.offset + (k % self.count) * self.size
+        return np.arange(first, first + self.size)
 
     def __getitem__(self, k: int) -> Affine:
-        return Affine(self.size, np.arange(self.size), self.index(k), self.scale.copy(), np.zeros(self.size))
+        if k not in self._members:  # many constraints use the same ones
+            rows, index = np.arange(self.size), self.index(k)
+            self._members[k] = Affine(self.size, rows, index, self.scale, np.zeros(self.size))
+        return self._members[k]
 
     def read(self, x: Array) -> Array:
         """Physical values, shape (count, size)."""
@@ -298,8 +312,7 @@ def _is_length(label: str) -> bool:
     return label.split()[-1] in ("x", "y", "z")
 
 
-@dataclass(frozen=True, eq=False)
-class ConstraintOrigin:
+class ConstraintOrigin(NamedTuple):
     """Origin of a constraint: its term, place and component, and the measure of its violation.
 
     whole : name that messages use in place of the component, such as the sole of a facet; None: the
@@ -353,7 +366,7 @@ class Constraints:
         measure = Measure(unit, 1.0, "beyond its bound")
         for k, origin in enumerate(self.origins[since:], since):
             if origin.term == term and origin.measure is None:
-                self.origins[k] = replace(origin, measure=measure)
+                self.origins[k] = origin._replace(measure=measure)
 
     def bound(self, k: int, lower: ArrayLike, upper: ArrayLike) -> None:
         """Replace the bounds of the constraints of call number ``k`` of :meth:`add`, which dropped none."""
@@ -392,16 +405,16 @@ class Constraints:
         check_kind(f"{term}: place", spot, Place)
         n = len(components)
         measures = [*measure] if isinstance(measure, Iterable) else [measure] * n
-        if len(measures) != n or not all(isinstance(each, Measure | None) for each in measures):
+        if len(measures) != n or not all(each is None or isinstance(each, Measure) for each in measures):
             raise InputError(f"{term}: measure must be a Measure, or one for each component")
         try:
-            lo, hi = (np.broadcast_to(np.asarray(x, dtype=float), (n,)) for x in (lower, upper))
+            lo, hi = (np.full(n, np.asarray(x, dtype=float)) for x in (lower, upper))
         except ValueError:
             raise InputError(
                 f"{term}: a bound of its {n} constraints is {shortened(repr((lower, upper)))}; "
                 "give one number, or as many as components"
             ) from None
-        if np.isnan([lo, hi]).any():
+        if np.isnan(lo).any() or np.isnan(hi).any():
             raise InputError(f"{term}: a bound of its constraints is NaN; give numbers, or inf for no bound")
         if outputs is None and affine is None:
             raise InputError(f"{term}: constraints of nothing; give outputs of a block, or affine, or both")
@@ -414,19 +427,18 @@ class Constraints:
                 raise InputError(f"{term}: {what} are {count}, components {n}; give as many of both")
         # what a term leaves unlimited has infinite bounds
         bounded = np.isfinite(lo) | np.isfinite(hi)
-        keep = np.flatnonzero(bounded)
-        if keep.size < n:
+        kept: Iterable[int] = range(n)
+        if not bounded.all():
+            keep = np.flatnonzero(bounded)
             self.unbounded.append(out[~bounded])
-            out, lin, lo, hi = out[keep], lin[keep], lo[keep], hi[keep]
-        if not keep.size:
+            out, lin, lo, hi, kept = out[keep], lin[keep], lo[keep], hi[keep], keep.tolist()
+        if not lo.size:
             return
         self.outputs.append(out)
         self.affine.append(lin)
         self.lower.append(lo)
         self.upper.append(hi)
-        self.origins.extend(
-            ConstraintOrigin(term, spot, components[int(k)], measures[int(k)], whole) for k in keep
-        )
+        self.origins.extend(ConstraintOrigin(term, spot, components[k], measures[k], whole) for k in kept)
 
 
 GRAVITY = 9.81  # [m/s^2] for the robot's weight, which scales forces; its model may have another gravity

@@ -7,6 +7,7 @@ and after these (`impactopt.transcription.stance_change`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -144,12 +145,13 @@ def _outside_cone(facet: Array, normal: Affine, friction: float) -> Measure:
     A facet without shear and torsion bounds the centre of pressure, one without moments of tilting and
     torsion the friction; the others combine these.
     """
-    shear, tilting = np.hypot(*facet[:2]), np.hypot(*facet[3:5])
-    if shear < 1e-9 and abs(facet[5]) < 1e-9:
+    x, y, z, roll, pitch, yaw = facet.tolist()
+    shear, tilting = math.hypot(x, y), math.hypot(roll, pitch)
+    if shear < 1e-9 and abs(yaw) < 1e-9:
         return Measure("mm", 1e3 / tilting, "outside", normal, 0.05)  # moment over normal force
-    if tilting < 1e-9 and abs(facet[5]) < 1e-9:
+    if tilting < 1e-9 and abs(yaw) < 1e-9:
         return Measure("%", 100 / shear / friction, "beyond its friction", normal, 0.05)
-    return Measure("%", 100 / max(facet[2], 1e-3), "beyond its friction and torsion", normal, 0.05)
+    return Measure("%", 100 / max(z, 1e-3), "beyond its friction and torsion", normal, 0.05)
 
 
 # End conditions of a spline: zero velocity and acceleration; none; zero acceleration.
@@ -210,6 +212,7 @@ class MotionPhase:
         self.nodes = np.union1d(regular[1:] if begins == REST else regular, more)
         self._begins, self._ends = begins, ends
         self._at: dict[float, tuple[Affine, Affine, Affine]] = {}
+        self._controls: dict[int, Affine] = {}
         self.unloaded: dict[int, Index] = {}
         self._last = len(self.breaks) + 1
         self._y0 = Affine.constant(b.y0)
@@ -243,10 +246,12 @@ class MotionPhase:
         torque that the swing ends with as feed-forward. So the torque does not jump at contact, and a target
         that comes late meets the same motion.
         """
-        point = self._control(j)
-        if self.drift is None or j not in self._drifting:
-            return point
-        return stack([self.drift[self._drifting.index(j)], point[6:]])
+        if j not in self._controls:
+            point = self._control(j)
+            if self.drift is not None and j in self._drifting:
+                point = stack([self.drift[self._drifting.index(j)], point[6:]])
+            self._controls[j] = point
+        return self._controls[j]
 
     def _control(self, j: int) -> Affine:
         if j < self.lead:

@@ -128,7 +128,7 @@ def drifting_reference(
 
         The base's coordinates (6,) are written to q (nq,), which has the joints'.
         """
-        v = np.append(np.zeros(6), yd[6:])
+        v = np.concatenate([np.zeros(6), yd[6:]])
         q[:3], q[3:7] = base[:3], pin.Quaternion(pin.rpy.rpyToMatrix(base[3:6])).coeffs()
         pin.ccrba(model, data, q, v)  # data.Ag: momentum matrix (6, nv); data.hg: momentum at v
         v[:6] = solved(np.array(data.Ag[:, :6]), momentum - np.array(data.hg.vector))

@@ -21,7 +21,8 @@ TOUCH = 1.0  # [px] by which extents may meet, as they have some air around thei
 def frowns(figure: Figure) -> list[str]:
     """What is cut by the picture's edge, which texts lie over each other, which legends over data."""
     # as saving does: a layout of axes of equal scales needs two passes
-    if (layout := figure.get_layout_engine()) is not None:
+    equal = any(axes.get_aspect() != "auto" for axes in figure.axes)
+    if equal and (layout := figure.get_layout_engine()) is not None:
         layout.execute(figure)
     figure.draw_without_rendering()
     renderer = figure.canvas.get_renderer()

@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid, quad, trapezoid
-from scipy.signal import find_peaks
 from support.small_plans import Planned, arm_problem, biped_problem, changed, transcribed
 from support.small_robots import biped
 
@@ -130,6 +129,8 @@ def test_a_continuous_joint_that_passes_half_a_turn_ends_near_its_start() -> Non
 
 @pytest.mark.parametrize("seed", range(10))
 def test_reversals_are_peaks_and_valleys_by_their_prominence(biped_plan: Planned, seed: int) -> None:
+    from scipy.signal import find_peaks  # here: every worker imports all files, and this takes 0.4 s
+
     problem, reference = biped_plan.problem, biped_plan.trajectory
     rates = 3.0 * np.random.default_rng(seed).standard_normal(reference.v.shape)
     found = motion_measures(problem, replace(reference, v=rates))["reversals"]

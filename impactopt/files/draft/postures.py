@@ -72,10 +72,10 @@ def _half_sitting(
     height = min(float(spot[2]) for spot in straight) + SQUAT * length
     ahead = float(np.mean([hip @ forward for hip in hips]))
     rng = np.random.default_rng(0)
-    for _ in range(4):  # move the feet below the centre of mass, which moves with the legs
+    for k in range(4):  # move the feet below the centre of mass, which moves with the legs
         for own, sole, out in zip(chains, soles, aside, strict=True):
             spot = ahead * turn[:, 0] + out * turn[:, 1] + height * turn[:, 2]
-            q = _leg(robot, own, sole, pin.SE3(turn, spot), q, forward, rng)
+            q = _leg(robot, own, sole, pin.SE3(turn, spot), q, forward, rng, follow=k > 0)
         centre = np.array(pin.centerOfMass(model, data, q))
         pin.framesForwardKinematics(model, data, q)
         middles = [
@@ -212,10 +212,13 @@ def _leg(
     q: Array,
     forward: Array,
     rng: np.random.Generator,
+    *,
+    follow: bool,
 ) -> Array:
     """The configuration with a leg's sole at its goal, a pin.SE3, and the knee as far forward as possible.
 
     joints : of the leg, of which the last six (or all) move.
+    follow : take the configuration that is found from q, where the knee is forward already.
     """
     model, data = robot.model, robot.model.createData()
     fid, own = model.getFrameId(sole.frame), _columns(robot, joints[-LEG:])
@@ -248,6 +251,8 @@ def _leg(
         knee = max(float(data.oMi[j].translation @ forward) for j in joints)
         if best is None or knee > best[0] + 1e-4:
             best = knee, found.x
+        if follow:
+            break
     if best is None:
         names = [model.names[j] for j in joints]
         raise InputError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -71,16 +72,23 @@ class Forces:
     mobility: float
 
     # ------------------------------------------------------------ joints
+    @cached_property
+    def _changes(self) -> bool:
+        """True if the reference's velocity changes."""
+        return bool(self.reference.any())
+
     def demand(self, time: float, moved: Array, velocity: Array) -> Array:
         """Torque (n,) [N m] of the servo before saturation; `moved`: angles (n,) [rad] since contact."""
-        t, powers = min(time, self.reference_until), np.arange(1, self.reference.shape[1] + 1)
-        # change of the reference's velocity up to t, after which it is constant, by powers; and its integral
-        # column k: coefficient times t^k, (n, k)
-        velocity_change = self.reference * t**powers
-        angle_change = velocity_change @ (t / (powers + 1) + (time - t))
-        rate_error = self.velocity + velocity_change.sum(axis=1) - velocity
+        rate_error = self.velocity - velocity
         # an angle of rest does not coast; the damper's torque at contact is in the feed-forward, as in plans
-        error = np.where(self.sprung, 0.0, self.velocity) * time + angle_change - moved
+        error = np.where(self.sprung, 0.0, self.velocity) * time - moved
+        if self._changes:
+            t, powers = min(time, self.reference_until), np.arange(1, self.reference.shape[1] + 1)
+            # change of the reference's velocity up to t, after which it is constant, by powers; and its
+            # integral; column k: coefficient times t^k, (n, k)
+            velocity_change = self.reference * t**powers
+            rate_error += velocity_change.sum(axis=1)
+            error += velocity_change @ (t / (powers + 1) + (time - t))
         return self.feedforward + _times(self.kp, error) + _times(self.kd, rate_error)
 
     def torque(self, demand: Array, phase: Phase) -> Array:

@@ -139,7 +139,7 @@ def nail_caution(problem: ImpactProblem, plan: Plan) -> str:
         return ""
     return (
         "The nail is not driven into the wood. With the objective target_energy, the initial guess 'strike' "
-        "(`--start strike`) or several (`--starts 8`) may find a harder blow; else ease its resistance."
+        "(`--start strike`) may find a harder blow; else take a smaller resistance."
     )
 
 

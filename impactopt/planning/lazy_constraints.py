@@ -12,6 +12,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from impactopt.arrays import Array
+from impactopt.contact.targets import Nail
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.planning.parameter_changes import changed
@@ -36,6 +37,7 @@ SLIDE_TOLERANCE = 0.03  # of the limit
 FAR = 0.15  # [m] across the target's face: a longer slide gets a warning
 CONTACT_SAMPLES = 9  # instants of the contact at which the slide is measured
 _MET = 1e-3  # [m] beyond the target's plane after contact: a striking point meets the target again
+_DRIVEN = 1e-5  # [m] into the wood: a nail that goes less deep gets a warning
 _AT_BOUND = 1e-3  # of a duration's bound: nearer ones are at it
 # A contact window gets a warning if twice its length gains this part of the objective, to first order.
 _COSTLY = 0.1
@@ -125,6 +127,18 @@ def slide_caution(problem: ImpactProblem, length: float) -> str:
         f"In replays the face ends {1e3 * FACE:.0f} mm from the hit point"
         # Two strikers have no such term.
         + (f"; {remedy} in [terms.slide] keeps it nearer." if problem.second is None else ".")
+    )
+
+
+def nail_caution(problem: ImpactProblem, plan: Plan) -> str:
+    """Warning about a nail that hardly moves; "" of other targets, and of one that does."""
+    # A nail that just starts to move takes no energy, and a little more speed does not change that to first
+    # order: it can be a local optimum.
+    if not isinstance(problem.target, Nail) or plan.collision.outcome["depth_m"] > _DRIVEN:
+        return ""
+    return (
+        "The nail is not driven into the wood. With the objective target_energy, the initial guess 'strike' "
+        "(`--start strike`) may find a harder blow; else take a smaller resistance."
     )
 
 

@@ -32,6 +32,7 @@ from impactopt.planning.gain_selection import ChosenGains
 from impactopt.planning.lazy_constraints import (
     gear_caution,
     lazy_terms_of,
+    nail_caution,
     slide,
     slide_caution,
     touch_caution,
@@ -451,7 +452,8 @@ class Solution(Solved):
         runs = [run for run in (replay, simulation) if run is not None]
         slides = slide_caution(self.problem, self.slide)
         again = touch_caution(self.problem, plan, runs[-1].impulse if runs else None)
-        cautions = (out.get("caution"), again, slides, self.window, overlapping(self.problem))
+        undriven = nail_caution(self.problem, plan)
+        cautions = (out.get("caution"), undriven, again, slides, self.window, overlapping(self.problem))
         if caution := " ".join(filter(None, cautions)):
             out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *(run.loads for run in runs)])

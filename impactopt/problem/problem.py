@@ -593,7 +593,7 @@ class ImpactProblem:
             ]
         if self.objectives != DEFAULT_OBJECTIVES:
             out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in self.objectives]
-        off = [term.name for term in (self.self_collision, self.keep_out) if not term.active]
+        off = [term.name for term in DEFAULT_TERMS if not self.term(type(term)).active]
         off += [term.name for term in ON_DEMAND_TERMS if self.term(type(term)) not in self.on_demand]
         if off:
             out["off"] = off

@@ -43,7 +43,8 @@ class GainFactor:
         if not listed or not self.joints or not all(isinstance(name, str) for name in self.joints):
             raise InputError(f"GainFactor: joints are names or patterns, at least one, not {self.joints!r}")
         object.__setattr__(self, "joints", tuple(self.joints))
-        least, largest = check_array("GainFactor: factor", self.factor, (2,)).tolist()
+        given = (self.factor, self.factor) if isinstance(self.factor, (int, float)) else self.factor
+        least, largest = check_array("GainFactor: factor", given, (2,)).tolist()
         if not MIN_FACTOR <= least < largest <= MAX_FACTOR:
             raise InputError(
                 f"GainFactor: factor is (least, largest) with {MIN_FACTOR:g} <= least < largest <= "

@@ -168,7 +168,7 @@ def _add_conditions(b: Builder, state: ContactState, block: str, number: int) ->
             lower=-incidence.speed,
             upper=incidence.speed,
             measure=Measure("m/s", 1.0, "too fast across the normal"),
-            whole="",
+            whole=prefix.strip(),
         )
 
 

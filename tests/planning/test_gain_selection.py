@@ -283,6 +283,12 @@ def test_a_factor_leaves_a_choice(factor: tuple[float, float]) -> None:
         GainFactor(joints=("wrist",), factor=factor)
 
 
+def test_one_number_as_a_factor_is_refused_with_the_function_that_takes_it() -> None:
+    """A file takes one, so a user tries it here, too."""
+    with pytest.raises(InputError, match="for one number take scaled_gains"):
+        GainFactor(joints=("wrist",), factor=0.5)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("factor", "words"),
     [

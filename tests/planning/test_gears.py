@@ -177,6 +177,14 @@ def test_a_saved_plan_is_made_again_with_its_rows(bounded: Solution, tmp_path: P
     np.testing.assert_array_equal(again.result.x, bounded.result.x)
 
 
+def test_a_first_touch_that_is_off_is_said() -> None:
+    """A draft switches it off for arms of few joints: one hit with another part, 59 mm in the target."""
+    setting = ["--set", "terms.first_touch.enabled=false"]
+    said = CliRunner().invoke(app, ["check", "arm_planar", *setting]).output
+    assert "off" in said and "first touch" in said
+    assert "first touch" not in CliRunner().invoke(app, ["check", "arm_planar"]).output
+
+
 @pytest.mark.slow
 def test_what_is_off_is_said(tmp_path: Path) -> None:
     """By `check`, in the result and on the page."""

@@ -24,6 +24,7 @@ from impactopt import (
     Solution,
     SpringDamper,
     Status,
+    TargetEnergy,
     load_problem,
     optimize_strike,
     solve,
@@ -271,6 +272,17 @@ def test_a_plan_of_one_touch_names_the_number_that_plans_them(damping: float, nu
     caution = solution.summary()["caution"]
     assert "part and meet again" in caution
     assert caution.count("touches = ") == bool(number) and number in caution
+
+
+@pytest.mark.slow
+def test_a_plan_that_does_not_drive_its_nail_says_so() -> None:
+    """A nail that just starts to move takes no energy, to first order: plans can end there."""
+    problem = load_problem("arm_planar")
+    least = dataclasses.replace(problem, objectives=(TargetEnergy(weight=-1.0),))
+    for given, driven in ((problem, True), (least, False)):
+        solution = solve(given)
+        assert (solution.validate(engine="mujoco").outcome["depth_m"] > 1e-3) == driven
+        assert ("is not driven" not in solution.summary().get("caution", "")) == driven
 
 
 # ---- boards that break after the last touch

@@ -160,6 +160,12 @@ def blow(solution: Solution, step: float) -> tuple[Array, float]:
     return impulses, t
 
 
+@pytest.mark.slow
+def test_what_limits_the_other_hand_has_its_name(solution: Solution) -> None:
+    binding = {each.row for each in solution.sensitivity("target.mass").binding}
+    assert {"incidence, contact", "incidence, contact, left_hand"} <= binding
+
+
 @needs_compiler
 @pytest.mark.slow
 def test_the_collision_is_that_of_full_dynamics(solution: Solution) -> None:

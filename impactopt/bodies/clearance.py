@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import coal
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.bodies.convex_hulls import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
 from impactopt.bodies.separation import THIN, Placed, Shapes
@@ -20,8 +20,6 @@ from impactopt.errors import InputError
 from impactopt.robots.build import parent_body
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 MISSED = 3  # phase without a target
 FAR = 1.0  # [m] clearance that stands for all larger ones
 _REQUEST = coal.DistanceRequest()
@@ -203,7 +201,7 @@ class Bodies:
         return bool(depths) and min(depths) > BEHIND
 
     @staticmethod
-    def present(body: WorldBody, at: Places) -> NDArray[np.bool_]:
+    def present(body: WorldBody, at: Places) -> Mask:
         """Mask (k,) of the instants at which a body of the world is present."""
         return np.asarray(at.phase == 0) if body.before else (at.phase != MISSED) | (not body.of_target)
 

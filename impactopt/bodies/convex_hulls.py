@@ -14,13 +14,13 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from impactopt.arrays import Array, Index
 from impactopt.bodies.file_shapes import Geom, LinkShape, geoms_of, lost_meshes, shapes_of
 from impactopt.bodies.solids import Solid, cached_arrays, cylinder, rounded_box
 from impactopt.robots.model import principal_moments
 from impactopt.robots.robot import Robot, Tool
 from impactopt.robots.tools import without
 
-Array = NDArray[np.float64]
 ROD = 0.012  # [m] radius of a tool
 _SHORTEST_SIDE = 0.02  # [m] of a box of inertia
 # [kg/m3] Least mean density of a link, half of a light foam's. The inertia of many files, such as 0.001 kg m2
@@ -47,7 +47,7 @@ class Piece:
     link: str
     joint: int
     vertices: Array
-    triangles: NDArray[np.intp]
+    triangles: Index
     assumed: bool = False
 
     @cached_property
@@ -64,7 +64,7 @@ class Piece:
         return float(np.min((((a - point) * out).sum(axis=1) / np.where(flat, 1.0, lengths))[~flat]))
 
 
-def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
+def convex(vertices: Array, triangles: Index) -> Any:
     """Hull as a coal.Convex."""
     points, facets = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     points.extend(list(vertices))

@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.solids import Solid, box, capsule, cylinder, find_mesh, lack_of, read_mesh, sphere
 from impactopt.errors import FARTHEST, InputError
 from impactopt.robots.mjcf import compile_mjcf
 from impactopt.robots.urdf import parse_urdf
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

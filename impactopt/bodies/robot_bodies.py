@@ -12,14 +12,13 @@ from typing import Any, NamedTuple
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from impactopt.arrays import Array
 from impactopt.bodies.convex_hulls import Piece, file_pieces, is_too_large, pieces_of
 from impactopt.robots.build import neutral, parent_body
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 Pair = tuple[int, int]
 # [m] Neighbours no farther apart than this in the start posture count as touching: they are made to fit, as a
 # joint in its fork, and constraints know the shapes of two links no better (`separation.THIN`, of each).

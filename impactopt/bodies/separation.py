@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.bodies import separation_numpy
 from impactopt.bodies.convex_hulls import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bounding_ball
@@ -39,8 +40,6 @@ from impactopt.codegen.compiler import address, native_library
 
 __all__ = ["ROUNDING", "THIN", "Looked", "Placed", "Separations", "Shapes", "packed", "thinned"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 THIN = 1e-3  # [m] largest distance of omitted vertices from the hull of the others
 _SMALL_HULL = 12  # vertices; hulls with no more keep them all
 _BLOCK = 8  # vertices that the C code handles at once
@@ -150,7 +149,7 @@ class Shapes:
         at: Placed,
         within: float | Array,
         directions: Array,
-        wanted: NDArray[np.bool_],
+        wanted: Mask,
         before: tuple[Placed, Looked] | None = None,
     ) -> Looked:
         """Distances of the pairs ``wanted`` (P,); those above ``within`` [m] may be lower bounds.

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from impactopt.arrays import Array, Index, Mask
+
 ROUNDING = 1e-3  # [m] e of the smoothed support functions, see separation.py
 _SHARP = 1 / ROUNDING
 _MIN_CURVATURE = 1e-4  # of a separation along the tangents of its direction, in Newton steps and Hessians
@@ -43,14 +42,14 @@ class _Side(NamedTuple):
     neg_hessian: Array
 
 
-def _gathered(points: Array, hulls: Index) -> tuple[Array, NDArray[np.bool_]]:
+def _gathered(points: Array, hulls: Index) -> tuple[Array, Mask]:
     """Vertices (m, most, 3) of hulls (m, 2), padded with copies, and a mask of those that are no copies."""
     most = int(hulls[:, 1].max(initial=1))
     at = hulls[:, :1] + np.minimum(np.arange(most), hulls[:, 1:] - 1)
     return points[at], np.arange(most) < hulls[:, 1:]
 
 
-def _support(vertices: Array, real: NDArray[np.bool_], u: Array) -> _Support:
+def _support(vertices: Array, real: Mask, u: Array) -> _Support:
     sharp = _SHARP
     # Padding has weight exp(-inf) = 0.
     height = np.where(real, np.einsum("mki,mi->mk", vertices, u), -np.inf)
@@ -71,7 +70,7 @@ class _Pairs:
         self.one, self.two = _gathered(points, hulls[:, :2]), _gathered(points, hulls[:, 2:])
         self.rotation, self.translation = rotation, translation
 
-    def only(self, chosen: NDArray[np.bool_]) -> _Pairs:
+    def only(self, chosen: Mask) -> _Pairs:
         out = object.__new__(_Pairs)
         out.one = self.one[0][chosen], self.one[1][chosen]
         out.two = self.two[0][chosen], self.two[1][chosen]
@@ -153,7 +152,7 @@ class _Pairs:
         return step2, np.einsum("mk,mk->m", step2, slope2)
 
 
-def _mask(numbers: NDArray[np.intp], size: int) -> NDArray[np.bool_]:
+def _mask(numbers: Index, size: int) -> Mask:
     out = np.zeros(size, dtype=bool)
     out[numbers] = True
     return out
@@ -166,7 +165,7 @@ def _inverse(neg_hessian: Array) -> Array:
 
 
 # ---------------------------------------------------------------- chains
-def _chain(n: int, z: Array, numbers: Array) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+def _chain(n: int, z: Array, numbers: Array) -> tuple[Array, Array, Array, Array, Mask]:
     """Forward kinematics of chains of n joints, with z and numbers as of `Separations`.
 
     Returns rotation (m, 3, 3) and translation (m, 3) of the end, axes and origins (m, n, 3) of the joints,
@@ -250,7 +249,7 @@ def look(
     at: Any,
     within: Array,
     directions: Array,
-    wanted: NDArray[np.bool_],
+    wanted: Mask,
     gaps: Array,
     before: tuple[Any, Any] | None,
 ) -> tuple[Index, Index]:

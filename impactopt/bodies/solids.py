@@ -17,9 +17,9 @@ import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from impactopt.arrays import Array, Index
 from impactopt.codegen.files import kept
 
-Array = NDArray[np.float64]
 SELF_CONTAINED = (
     ".dae",
     ".obj",
@@ -35,7 +35,7 @@ class Solid:
     """Surface: vertices (n, 3) [m] and triangles (m, 3), indices counter-clockwise seen from outside."""
 
     vertices: Array
-    triangles: NDArray[np.intp]
+    triangles: Index
 
     def moved(self, rotation: Array, translation: Array) -> Solid:
         """Copy, rotated and translated."""
@@ -152,7 +152,7 @@ def simplified(solid: Solid, cell: float) -> Solid:
     return Solid(vertices=vertices[used], triangles=triangles.reshape(-1, 3))
 
 
-def _sums(label: NDArray[np.intp], values: Array, n: int) -> Array:
+def _sums(label: Index, values: Array, n: int) -> Array:
     """Sums (n, k) of values (m, k) by label (m,)."""
     return np.stack([np.bincount(label, weights=column, minlength=n) for column in values.T], axis=1)
 

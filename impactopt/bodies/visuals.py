@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from impactopt.arrays import Array
 from impactopt.bodies.convex_hulls import ROD, bare_joints, inertia_box, is_too_large, tool_solids
 from impactopt.bodies.file_shapes import geoms_of, numbers, shapes_of, urdf_elements
 from impactopt.bodies.solids import Solid, box, cylinder, joined, sphere
@@ -19,7 +19,6 @@ from impactopt.bodies.world import WorldBody
 from impactopt.robots.attachments import Tool
 from impactopt.robots.robot import Robot, Striker
 
-Array = NDArray[np.float64]
 GREY = (0.72, 0.74, 0.77)  # default colour
 JOINT, BONE = (0.35, 0.37, 0.40), (0.55, 0.57, 0.60)
 THIN, THICK = ROD, 0.028  # [m] radii of a bone, and of the ball at its joint

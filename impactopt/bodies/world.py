@@ -10,8 +10,8 @@ from typing import Any
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.bodies.solids import Solid, capsule
 from impactopt.bodies.solids import box as cuboid
 from impactopt.contact.fields import Described, about
@@ -104,14 +104,14 @@ class Obstacle(Described):
             object.__setattr__(self, "end", self.start)
 
     @property
-    def centre(self) -> NDArray[np.float64]:
+    def centre(self) -> Array:
         """Centre (3,) [m]."""
         if self.size is not None or self.start is None or self.end is None:
             return np.array(self.position)
         return (np.array(self.start) + np.array(self.end)) / 2
 
     @property
-    def half(self) -> NDArray[np.float64]:
+    def half(self) -> Array:
         """Half sides (3,) [m] of the box; of a capsule's axis, along z."""
         if self.size is not None:
             return np.array(self.size) / 2
@@ -122,7 +122,7 @@ class Obstacle(Described):
         return float(np.linalg.norm(np.subtract(self.end or (), self.start or ())))
 
     @property
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Array:
         """Rotation (3, 3); columns are the axes in the world."""
         if self.size is None:
             if self._length < 1e-9:
@@ -147,7 +147,7 @@ class Ground(Described):
         object.__setattr__(self, "height", float(height))
 
 
-def face_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+def face_axes(normal: Array) -> Array:
     """Orthonormal axes of a target's face as rows (3, 3): normal, across (level, to the left), up.
 
     For a vertical normal, across is the world's y.
@@ -158,7 +158,6 @@ def face_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([normal, across, np.cross(normal, across)])
 
 
-Array = NDArray[np.float64]
 # [m] The core of a target begins so far behind its face. The striker must not touch it before contact, so
 # that it cannot come through the target from behind.
 BEHIND = 0.08

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from impactopt.arrays import Array, Index
+
 # For functions of one instance a call. Functions in SIMD lanes are done before a thread has started.
 THREADS = 2
 MAX_MAPPED_CALLS = 64  # CasADi takes long to map a function to more calls

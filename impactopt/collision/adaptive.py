@@ -14,14 +14,12 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import LSODA
 from scipy.optimize import brentq, minimize_scalar
 
+from impactopt.arrays import Array
 from impactopt.collision.model import JointSpaceModel
 from impactopt.collision.stepped import target_is_linear
-
-Array = NDArray[np.float64]
 
 # Permitted error of a step over the tolerance, relative, and absolute in SI units: errors of steps add up.
 _RELATIVE, _ABSOLUTE = 1e-3, 1e-8

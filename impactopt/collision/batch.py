@@ -18,8 +18,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array
 from impactopt.codegen.cache import cached, library_path
 from impactopt.collision.checks import (
     ACCURACY,
@@ -36,7 +37,6 @@ from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError, check_array, check_whole, raw_array
 from impactopt.robots.checks import unit_parts
 
-Array = NDArray[np.float64]
 _ALIGNED = 8  # doubles that a work array is longer, as the C code aligns it
 _CHECKED_TOGETHER = 256  # cases whose step lengths are checked in one call
 

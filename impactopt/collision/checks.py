@@ -16,14 +16,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Mask
 from impactopt.collision.graph import frozen_dynamics, joint_space_model
 from impactopt.collision.interface import Collision
 from impactopt.collision.model import JointSpaceModel
 from impactopt.collision.stepped import TAKE_FULL, SteppedModel
 from impactopt.contact import Board
 from impactopt.errors import InputError
-
-Array = NDArray[np.float64]
 
 # name of the output of a batch
 FREEZE_ERROR = "freeze_error"
@@ -284,7 +283,7 @@ class Stability:
             rates.append(float(np.abs(np.linalg.eigvals(matrix)).max()))
         return _STABILITY_LIMIT / max(rates)
 
-    def unstable(self, given: Mapping[str, Array]) -> NDArray[np.bool_]:
+    def unstable(self, given: Mapping[str, Array]) -> Mask:
         """Mask (N) of the cases of a batch with an unstable step.
 
         given : inputs by name, with a first axis of N or 1.

@@ -24,8 +24,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.codegen.compiler import CompileError, NativeCode, find_compiler, why_no_compiler
 from impactopt.collision.native import native_collision, native_differences, native_gradient, native_jacobian
 from impactopt.collision.native.sizes import directions, shapes_out
@@ -36,7 +36,6 @@ from impactopt.errors import InputError
 from impactopt.robots.checks import unit_parts
 from impactopt.robots.rigid_body import RigidBody
 
-Array = NDArray[np.float64]
 Compile = Callable[[str, tuple[Any, ...], Callable[[], Any]], Any]
 
 # Step of the differences that give second derivatives, relative to an input's size. It is longer if the first

@@ -32,10 +32,9 @@ from functools import cache
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import roots_laguerre
 
-Array = NDArray[np.float64]
+from impactopt.arrays import Array
 
 
 def bernstein_matrix(degree: int) -> Array:

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array
 from impactopt.collision.outputs import HISTORIES, OUTPUTS, SCALARS
 from impactopt.contact import ContactLaw, Target
 from impactopt.errors import InputError, check_direction, check_positive
 from impactopt.kinematics.stance import Stance, stance_of
 from impactopt.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

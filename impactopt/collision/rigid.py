@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array
 from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.contact import FreeMass, RigidWall
 from impactopt.errors import InputError, check_array, check_choice, check_number
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 
-Array = NDArray[np.float64]
 MIN_MOBILITY = 1e-12  # [1/kg] of hand and target together; with less, rounding decides about the impulse
 
 

@@ -10,8 +10,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array
 from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.errors import (
     MOST,
@@ -87,7 +88,7 @@ class JointFriction:
                 raise InputError(f"JointFriction: {name} must be >= 0")
         check_positive("JointFriction: transition [rad/s]", self.transition, most=MOST)
 
-    def arrays(self, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def arrays(self, n: int) -> tuple[Array, Array]:
         """Coefficients (viscous, coulomb), each (n,)."""
         out = []
         for name in ("viscous", "coulomb"):
@@ -96,8 +97,6 @@ class JointFriction:
             out.append(check_array(f"JointFriction: {name} (one a joint)", value, (n,)))
         return out[0], out[1]
 
-
-Array = NDArray[np.float64]
 
 # permitted signs of the servo's settings
 _SIGN = {
@@ -254,7 +253,7 @@ _MAX_ERROR = 1e-4  # [rad/s] of a good fit
 
 def coasting_reference(
     coordinates: StanceCoordinates, q: ArrayLike, v: ArrayLike, *, until: float = 0.1
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Array]:
     """Settings of a collision model in which the servo's reference keeps the soles in place.
 
     During contact a plan's reference keeps the rates ydot of its independent coordinates: the base's pose and

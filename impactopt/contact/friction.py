@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.contact.fields import Described, Parameters, about, check_numbers
 from impactopt.contact.targets.base import Target
 from impactopt.errors import InputError
 
-Array = NDArray[np.float64]
 UNBENT: Array = np.zeros(3)  # deflection [m] of bristles before contact
 TINY = 1e-9  # [m] added to a deflection, whose length has no slope at zero
 

@@ -24,9 +24,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.errors import InputError
 from impactopt.robots.build import joint_indices
 from impactopt.robots.checks import LEG, check_arms, check_legs
@@ -35,8 +35,6 @@ from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.tools import check_held
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 # [rad] at the start and in a plan, of a base that floats freely: near pi/2 roll and yaw turn about one axis
 MAX_START_PITCH, MAX_PITCH = 1.2, 1.4
 # Newton's method for a leg's inverse kinematics
@@ -563,7 +561,7 @@ class StanceCoordinates:
         return np.concatenate([q[: self.base], joints[self.independent]]), joints[self.dependent]
 
     @cached_property
-    def _unlimited(self) -> NDArray[np.bool_]:
+    def _unlimited(self) -> Mask:
         """Mask of the base's roll and yaw and of continuous joints without limits among all coordinates."""
         base = np.isin(np.arange(self.base), (3, 5))
         continuous = [self.model.joints[j].nq == 2 for j in joint_indices(self.model)]

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates, solved
 from impactopt.kinematics.operational_space import across
@@ -19,7 +19,6 @@ from impactopt.kinematics.stance import inward_edges, margin
 from impactopt.robots.robot import Robot
 from impactopt.robots.tools import inside
 
-Array = NDArray[np.float64]
 UNBOUNDED = 50.0  # [rad, m] stands for an infinite bound
 
 

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array
 from impactopt.errors import MOST, InputError, check_direction, check_number
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import Stance, stance_of
 from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 def across(direction: Array) -> Array:
@@ -29,7 +28,7 @@ def across(direction: Array) -> Array:
     return np.asarray(np.linalg.svd(direction.reshape(1, 3))[2][1:])
 
 
-def striking_point(robot: Robot, striker: str, q: NDArray[np.float64]) -> NDArray[np.float64]:
+def striking_point(robot: Robot, striker: str, q: Array) -> Array:
     """Position (3,) [m] of a striker's striking point in the world, at a configuration q (nq,); (k, 3) at
     configurations (k, nq).
     """

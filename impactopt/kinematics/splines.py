@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 
-Array = NDArray[np.float64]
+from impactopt.arrays import Array
 
 
 def graded_breaks(intervals: int, ratio: float, *, fine_end: bool) -> Array:

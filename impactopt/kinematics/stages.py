@@ -12,7 +12,8 @@ from typing import Any
 
 import casadi as ca
 
-from impactopt.kinematics.coordinates import Index, StanceCoordinates, solve_in_order
+from impactopt.arrays import Index
+from impactopt.kinematics.coordinates import StanceCoordinates, solve_in_order
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError, check_array, check_kind
 from impactopt.robots.robot import Robot, Sole, Striker
 
@@ -55,7 +56,7 @@ class Stance(ABC):
         return self.sole_frames(robot) + self.hand_frames(robot)
 
     @property
-    def compliance(self) -> NDArray[np.float64]:
+    def compliance(self) -> Array:
         """Compliance (6,) of each fixed frame in world axes, acceleration over force.
 
         [1/kg] in translation, [1/(kg m2)] in rotation.
@@ -101,7 +102,7 @@ class _OnSoles(Stance):
         return tuple(robot.striker(name) for name in self.hands)
 
     @property
-    def compliance(self) -> NDArray[np.float64]:
+    def compliance(self) -> Array:
         if self.base_mass is None or self.base_inertia is None:
             return np.zeros(6)
         return np.array([1.0 / self.base_mass] * 3 + [1.0 / self.base_inertia] * 3)
@@ -175,7 +176,6 @@ def _check_floating(robot: Robot) -> None:
         )
 
 
-Array = NDArray[np.float64]
 _ON_LINE = 1e-9  # [m] a corner nearer to a line than this lies on it
 
 

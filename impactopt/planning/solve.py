@@ -14,8 +14,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.bounds import Cause
 from impactopt.planning.budget import VIOLATED, Budget, with_effort_of
@@ -57,7 +58,6 @@ from impactopt.transcription.mesh import NO_MORE
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, statement_of
 
-Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
 _HOPELESS_ITERATIONS = 100  # of each program of a problem that is unlikely to have a solution
 _SAME_POSTURE = 1e-6  # [rad], [m] largest difference of a coordinate

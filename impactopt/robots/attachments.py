@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array
 from impactopt.errors import FARTHEST, InputError, check_array, check_positive, raw_array
 from impactopt.robots import checks
 from impactopt.robots.checks import HEAVIEST
 
-Array = NDArray[np.float64]
 MAX_HINGE_RANGE = 0.5  # [rad]
 
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array, Mask
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, check_array, check_choice, named_table, raw_array, shortened
 from impactopt.robots.actuators import Actuator
@@ -20,7 +21,6 @@ from impactopt.robots.attachments import Striker
 from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame, reduced, tell_apart
 from impactopt.robots.model import JointAngles
 
-Array = NDArray[np.float64]
 MAX_ATTACHMENTS = 100  # soles, strikers or tools of a robot; more are a mistake
 
 
@@ -64,7 +64,7 @@ def joint_names(model: pin.Model) -> tuple[str, ...]:
     return tuple(str(model.names[j]) for j in joint_indices(model))
 
 
-def prismatic(model: pin.Model) -> NDArray[np.bool_]:
+def prismatic(model: pin.Model) -> Mask:
     """Mask of the prismatic joints among those of `joint_indices`."""
     return np.array(["JointModelP" in joint.shortname() for joint in moving_joints(model)], dtype=bool)
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array
 from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, counted, did_you_mean
 from impactopt.robots.model import mass_matrix, principal_moments
 
@@ -24,7 +25,7 @@ def tell_apart(model: pin.Model) -> None:
             frame.name = f"joint {frame.name}"
 
 
-def reduced(model: pin.Model, locked: Sequence[int], q: NDArray[np.float64], *geometry: Any) -> Any:
+def reduced(model: pin.Model, locked: Sequence[int], q: Array, *geometry: Any) -> Any:
     """`pin.buildReducedModel`: the model without joints that are locked at q (nq,); with `geometry`, also the
     reduced pin.GeometryModel.
 
@@ -46,8 +47,6 @@ def reduced(model: pin.Model, locked: Sequence[int], q: NDArray[np.float64], *ge
     tell_apart(found)
     return out
 
-
-Array = NDArray[np.float64]
 
 # Fastest plausible servo [1/s]: its time constant of 33 us is below a tenth of any servo's sampling time.
 # Light wrists without armature reach 1e5.

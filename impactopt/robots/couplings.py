@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError, Mistakes
 from impactopt.robots.build import (
     friction,
@@ -27,8 +27,6 @@ from impactopt.robots.build import (
     velocity_limit,
 )
 from impactopt.robots.model import MIMIC, axis_of
-
-Array = NDArray[np.float64]
 
 
 class Coupling(NamedTuple):

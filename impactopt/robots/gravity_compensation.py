@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.robots.build import is_floating
 
-Array = NDArray[np.float64]
 # Part of a joint's torque limit that the weight of bodies with another fraction may load it with.
 NEGLIGIBLE = 0.05
 _ROUNDING = 1e-9  # of the cosine between an axis and gravity

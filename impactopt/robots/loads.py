@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.robots.actuators import numbers_of
 from impactopt.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 def gear_torque(robot: Robot, torque: ArrayLike, acceleration: ArrayLike) -> Array:
@@ -156,7 +155,7 @@ def margin_between_nodes(asked: float) -> float:
     return asked - max(SHARE * asked, FREE)
 
 
-def fading(standing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def fading(standing: Mask) -> Mask:
     """Mask (phases, soles) of soles that stand in a phase, but not in the one before or after.
 
     standing (phases, soles) : mask of standing soles.
@@ -169,9 +168,9 @@ def least_margins(
     names: Sequence[str],
     cop: Array,
     force: Array,
-    phases: Mapping[str, NDArray[np.bool_]],
-    standing: NDArray[np.bool_] | None = None,
-    stance: NDArray[np.intp] | None = None,
+    phases: Mapping[str, Mask],
+    standing: Mask | None = None,
+    stance: Index | None = None,
 ) -> dict[str, dict[str, dict[str, float]]]:
     """Least margin [mm] and least normal force [N] of each sole in each phase, as in ``summary.json``.
 
@@ -184,7 +183,7 @@ def least_margins(
     if standing is not None and stance is not None:
         stands, loaded = standing[stance], (standing & ~fading(standing))[stance]
 
-    def least(values: Array, chosen: NDArray[np.bool_]) -> dict[str, dict[str, float]]:
+    def least(values: Array, chosen: Mask) -> dict[str, dict[str, float]]:
         return {
             name: {phase: float(column[at & own].min()) for phase, at in phases.items() if (at & own).any()}
             for name, column, own in zip(names, values.T, chosen.T, strict=True)

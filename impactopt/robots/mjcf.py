@@ -19,8 +19,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, missing_package
 from impactopt.robots.build import ROOT, existing, friction, set_friction
@@ -29,7 +29,6 @@ from impactopt.robots.description import Description, Tie, between
 from impactopt.robots.gravity_compensation import CompensatedBody, Compensation, compensation
 from impactopt.robots.model import JointAngles
 
-Array = NDArray[np.float64]
 _OUT = "take it out"
 _SPAN = 0.1  # least determinant of three axes that move a body in all directions
 

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from impactopt.arrays import Array
+
 MIMIC = "JointModelMimic"  # Pinocchio's name of a follower's joint
 
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array, Mask
 from impactopt.errors import Mistakes, check_array, check_kind, raw_array
 from impactopt.robots import build, checks, tools
 from impactopt.robots import mjcf as _mjcf
@@ -34,7 +35,6 @@ from impactopt.robots.tools import check_sole, with_hinges
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
 
-Array = NDArray[np.float64]
 MAX_GRAVITY = 1e3  # [m/s2]
 PerJoint = float | Mapping[str, float] | ArrayLike | None
 
@@ -324,7 +324,7 @@ class Robot:
         return tuple(build.moving_joints(self.model))
 
     @property
-    def prismatic(self) -> NDArray[np.bool_]:
+    def prismatic(self) -> Mask:
         """(n,) mask of prismatic joints: their SI units are m, N and kg."""
         return build.prismatic(self.model)
 
@@ -436,17 +436,17 @@ class Robot:
         return dataclasses.replace(self, **tools.fields_with_grip(self, name, grip))
 
     @property
-    def passive(self) -> NDArray[np.bool_]:
+    def passive(self) -> Mask:
         """(n,) mask of joints without a motor: `sprung` ones and `hinges`."""
         return self.sprung | self.hinges
 
     @property
-    def sprung(self) -> NDArray[np.bool_]:
+    def sprung(self) -> Mask:
         """(n,) mask of joints of soft grips, which have a spring and a damper and no motor."""
         return np.isin(self.joint_names, [tool.grip_joint for tool in self.tools if tool.grip is not None])
 
     @property
-    def hinges(self) -> NDArray[np.bool_]:
+    def hinges(self) -> Mask:
         """(n,) mask of hinges of soles, which have neither motor nor spring."""
         return np.isin(self.joint_names, [sole.hinge_joint for sole in self.soles if sole.hinge is not None])
 

@@ -8,15 +8,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.robots import build, checks
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import SoftGrip, Sole, Tool
 from impactopt.robots.checks import check_frame
-
-Array = NDArray[np.float64]
 
 
 def with_joint(

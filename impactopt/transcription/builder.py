@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array, Index
 from impactopt.codegen.batched import BatchedFunction
 from impactopt.errors import InputError, did_you_mean
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.violation import Measure, Place
 from impactopt.transcription import blocks as symbolic
-from impactopt.transcription.layout import Affine, Array, Constraints, Group, Index, Layout, Limits, stack
+from impactopt.transcription.layout import Affine, Constraints, Group, Layout, Limits, stack
 
 
 @dataclass

@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 import scipy.sparse as sp
 
+from impactopt.arrays import Array, Index
 from impactopt.bodies.separation import Separations
 from impactopt.bodies.world import WorldBody
 from impactopt.kinematics.coordinates import StanceCoordinates
@@ -26,7 +27,7 @@ from impactopt.problem.violation import Place, millimetres
 from impactopt.robots.model import Axis, axis_of
 from impactopt.robots.robot import Robot
 from impactopt.transcription.builder import Block, Builder
-from impactopt.transcription.layout import Affine, Array, ConstraintOrigin, Index, stack
+from impactopt.transcription.layout import Affine, ConstraintOrigin, stack
 
 TOO_NEAR = millimetres("too near")
 

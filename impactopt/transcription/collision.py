@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from impactopt.arrays import Array, Index
 from impactopt.contact.friction import moves_target, tangential_mobility, tangential_outcome
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN
@@ -37,9 +38,7 @@ from impactopt.transcription.contact_state import (
 from impactopt.transcription.layout import (
     DIRECTIONS,
     Affine,
-    Array,
     Group,
-    Index,
     Turn,
     add,
     along,

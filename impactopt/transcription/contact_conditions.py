@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from impactopt.arrays import Array
 from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.kinematics.stance import inward_edges, support_polygon
 from impactopt.problem.objectives import AngularMomentum
@@ -20,7 +21,7 @@ from impactopt.problem.violation import Measure, Place, millimetres
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_state import ContactState
-from impactopt.transcription.layout import Affine, Array, Group
+from impactopt.transcription.layout import Affine, Group
 from impactopt.transcription.motion_phase import MotionPhase
 
 # Distance [m] of the striking point behind the target's plane, before contact and after it. Nearer to

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, linprog
 
+from impactopt.arrays import Array
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Nail, Target
 from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN, contact_phases
@@ -27,7 +28,6 @@ from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.problem.checks import MOST_TOUCHES
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import VelocityLimit
-from impactopt.transcription.layout import Array
 
 MAX_CONTACT_TIME = 0.2  # [s] the integration of a contact ends here
 # [s] first phase of a nail that moves at first touch: no phase may be empty

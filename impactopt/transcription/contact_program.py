@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from impactopt.arrays import Array, Index
 from impactopt.contact.fields import in_order
 from impactopt.errors import InputError
 from impactopt.problem.objectives import OBJECTIVES, PEAK_SCALE, Objective
@@ -31,17 +32,7 @@ from impactopt.transcription.contact_blocks import DEPTH_SCALE
 from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import ContactEnd, DrivePoint, joint_motion_slots
 from impactopt.transcription.frozen_collision import InstantImpact
-from impactopt.transcription.layout import (
-    Affine,
-    Array,
-    Constraints,
-    Group,
-    Index,
-    Layout,
-    Turn,
-    by_choice,
-    determined,
-)
+from impactopt.transcription.layout import Affine, Constraints, Group, Layout, Turn, by_choice, determined
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.springs import SpringPoint, add_hinges, add_springs
 from impactopt.transcription.structured import StructuredProgram

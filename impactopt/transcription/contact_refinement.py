@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
+from impactopt.arrays import Array, Index
 from impactopt.contact.targets.base import Target
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -23,7 +24,7 @@ from impactopt.transcription.contact_blocks import DEPTH_SCALE, RESTITUTING
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_set import ContactSet, approaches
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
-from impactopt.transcription.layout import Affine, Array, Index
+from impactopt.transcription.layout import Affine
 from impactopt.transcription.mesh import GEAR, CollocationPoint, Elements, halved, lagrange
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, gear_share
 from impactopt.transcription.structured import StructuredProgram

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.arrays import Array, Index
 from impactopt.contact.friction import moves_target
 from impactopt.problem.violation import Place, percent
 from impactopt.solvers.program import Determined
@@ -16,7 +17,7 @@ from impactopt.transcription.collision import Collision, FirstInstant
 from impactopt.transcription.contact_guess import mass_at_contact
 from impactopt.transcription.contact_state import Contact, ContactEnd, DrivePoint
 from impactopt.transcription.frozen_collision import FrozenCollision, InstantImpact
-from impactopt.transcription.layout import Array, Index, Turn, determined
+from impactopt.transcription.layout import Turn, determined
 from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
 

@@ -11,13 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from impactopt.arrays import Array
 from impactopt.contact.laws import ContactLaw
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.violation import Place, percent
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact_guess import natural_durations
-from impactopt.transcription.layout import Affine, Array, Group
+from impactopt.transcription.layout import Affine, Group
 from impactopt.transcription.mesh import CollocationPoint
 
 # Least durations of contact phases, as fractions of that of compression or restitution (`contact_duration`).

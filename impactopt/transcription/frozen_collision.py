@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.arrays import Array
 from impactopt.collision.graph import target_start
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ReferenceRange
@@ -34,17 +35,7 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import coasted, effective_mass
 from impactopt.transcription.contact_state import Contact, ContactEnd, joint_motion_slots
-from impactopt.transcription.layout import (
-    DIRECTIONS,
-    Affine,
-    Array,
-    Group,
-    Turn,
-    along,
-    by_leg,
-    determined,
-    rates,
-)
+from impactopt.transcription.layout import DIRECTIONS, Affine, Group, Turn, along, by_leg, determined, rates
 from impactopt.transcription.mesh import CollocationPoint, Shares, lagrange, place_of, segment_of
 from impactopt.transcription.plan import PlannedCollision
 

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import lsq_linear
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates, independent_rates
 from impactopt.kinematics.operational_space import static_wrenches
@@ -23,7 +24,7 @@ from impactopt.transcription.contact_guess import effective_mass, speed_that_lea
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import map_stages, same_places
 from impactopt.transcription.frozen_collision import bounds_reference
-from impactopt.transcription.layout import Array, ConstraintOrigin, Group
+from impactopt.transcription.layout import ConstraintOrigin, Group
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.plan import drifting_reference

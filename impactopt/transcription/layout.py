@@ -21,8 +21,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impactopt.arrays import Array, Index
 from impactopt.errors import InputError, check_kind, shortened
 from impactopt.kinematics.coordinates import MAX_PITCH, StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
@@ -40,16 +41,14 @@ from impactopt.problem.violation import Measure, Place, degrees, millimetres
 from impactopt.robots.tools import inside
 from impactopt.solvers.program import Determined
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Affine:
     """``size`` affine expressions  const + V x  of the decision vector x; sparse V (size, n) as triplets."""
 
     size: int
-    rows: NDArray[np.intp]
-    cols: NDArray[np.intp]
+    rows: Index
+    cols: Index
     vals: Array
     const: Array
 
@@ -104,7 +103,7 @@ class Affine:
     def __rsub__(self, other: ArrayLike) -> Affine:
         return -self + other
 
-    def __getitem__(self, index: NDArray[np.intp] | slice) -> Affine:
+    def __getitem__(self, index: Index | slice) -> Affine:
         keep = np.atleast_1d(np.arange(self.size)[index])
         return select(self, keep)
 
@@ -127,7 +126,7 @@ class Affine:
         return self.const + np.bincount(self.rows, self.vals * x[self.cols], self.size)
 
 
-def select(expression: Affine, keep: NDArray[np.intp]) -> Affine:
+def select(expression: Affine, keep: Index) -> Affine:
     """Expressions with numbers ``keep``, in this order; a number may be repeated."""
     order = np.argsort(expression.rows, kind="stable")
     of_row = expression.rows[order]
@@ -190,7 +189,7 @@ class Group:
     measures: tuple[Measure, ...] = ()
     _members: dict[int, Affine] = field(default_factory=dict, repr=False, compare=False)
 
-    def index(self, k: int) -> NDArray[np.intp]:
+    def index(self, k: int) -> Index:
         if not -self.count <= k < self.count:
             raise IndexError(f"{self.name} has {self.count} members, not {k}")
         first = self.offset + (k % self.count) * self.size
@@ -288,9 +287,6 @@ class Layout:
         g = self.group_of(j)
         k = j - g.offset
         return f"{g.name}[{k // g.size}], {g.labels[k % g.size]}"
-
-
-Index = NDArray[np.intp]
 
 
 def by_leg(joints: Index) -> list[Index]:

@@ -13,8 +13,8 @@ from itertools import accumulate, count
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impactopt.arrays import Array, Mask
 from impactopt.contact.targets import Target
 from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.stance import contact_wrench_cone
@@ -25,7 +25,6 @@ from impactopt.robots.tools import inside
 from impactopt.transcription.contact_guess import mass_at_contact, natural_durations
 from impactopt.transcription.plan import Piece, Plan, Trajectory, gear_share
 
-Array = NDArray[np.float64]
 # Tolerances between nodes, wider than the constraints at the nodes.
 _MARGIN_LOSS = 0.5  # fraction of a margin that may be lost: of torques, normal forces, and joint ranges
 _TORQUE_LOSS = 0.01  # of the torque limit; the least tolerance, if the problem leaves no margin
@@ -119,7 +118,7 @@ def _middles_violated(plan: Plan, reference: Trajectory, piece: Piece) -> list[f
     return [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
 
 
-def _soles_violated(problem: ImpactProblem, number: int, wrenches: Array) -> NDArray[np.bool_]:
+def _soles_violated(problem: ImpactProblem, number: int, wrenches: Array) -> Mask:
     """Mask (k,) of instants at which a standing sole of a stance phase exceeds its tolerances.
 
     wrenches (k, 6 a sole) : of all soles of the problem. Friction of a sole that lifts off or touches down in

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.arrays import Array, Index
 from impactopt.kinematics.splines import CubicSpline, basis, graded_breaks, knots, rate_weights
 from impactopt.kinematics.stance import contact_wrench_cone
 from impactopt.problem.problem import Phase
@@ -26,9 +27,7 @@ from impactopt.transcription.layout import (
     DIRECTIONS,
     GRAVITY,
     Affine,
-    Array,
     Group,
-    Index,
     Turn,
     add,
     along,

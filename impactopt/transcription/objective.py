@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from impactopt.arrays import Array
 from impactopt.errors import InputError
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.objectives import Objective
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.layout import Affine, Array, Group, Layout, stack
+from impactopt.transcription.layout import Affine, Group, Layout, stack
 from impactopt.transcription.motion_phase import MotionPhase
 
 

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicHermiteSpline
 
+from impactopt.arrays import Array, Index, Mask
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates, base_rates, solved
 from impactopt.kinematics.splines import CubicSpline
@@ -35,7 +35,6 @@ from impactopt.robots.loads import (
 from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 
-Array = NDArray[np.float64]
 # [s] Steps of the coarse references, from which loads and clearances are taken, and of all references in
 # contact, at most. Loads change no faster than the nodes are apart, and inverse dynamics of every millisecond
 # is slow.
@@ -221,7 +220,7 @@ class Trajectory:
     """
 
     time: Array = field(repr=False)
-    phase: NDArray[np.intp] = field(repr=False)
+    phase: Index = field(repr=False)
     q: Array = field(repr=False)
     v: Array = field(repr=False)
     a: Array = field(repr=False)
@@ -231,7 +230,7 @@ class Trajectory:
     contact_start: float
     contact_end: float
     end: float
-    stance: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
+    stance: Index = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -284,7 +283,7 @@ class Motion:
     """
 
     time: Array = field(repr=False)
-    phase: NDArray[np.intp] = field(repr=False)
+    phase: Index = field(repr=False)
     q: Array = field(repr=False)
     displacement: Array = field(repr=False)
 
@@ -789,7 +788,7 @@ class Plan:
             }
         return out
 
-    def _zmp_margin(self, reference: Trajectory, chosen: NDArray[np.bool_]) -> Array:
+    def _zmp_margin(self, reference: Trajectory, chosen: Mask) -> Array:
         """ZMP margins (k,) [m] in the support polygon of each instant's stance phase, at chosen instants."""
         if not reference.stance.size:
             return margin_of(self.polygon, reference.ground[chosen])

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from impactopt.arrays import Array
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.problem.violation import Place, percent
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.layout import Affine, Array, add
+from impactopt.transcription.layout import Affine, add
 from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.plan import complete_reference
 

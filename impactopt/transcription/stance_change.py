@@ -16,11 +16,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from impactopt.arrays import Array, Index
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.violation import Place, millimetres, percent
 from impactopt.robots.loads import fading
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.layout import Affine, Array, Index, rates, select, stack
+from impactopt.transcription.layout import Affine, rates, select, stack
 from impactopt.transcription.mesh import MoreNodes
 from impactopt.transcription.motion_phase import FREE, REST, MotionPhase, add_nodes, node_numbers
 from impactopt.transcription.plan import PlannedStand

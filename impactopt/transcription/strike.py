@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from impactopt.arrays import Array
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.violation import Measure, Place
 from impactopt.solvers.program import Determined
@@ -20,7 +21,7 @@ from impactopt.transcription.contact_conditions import add_balance, add_conditio
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
-from impactopt.transcription.layout import Affine, Array, along, by_leg, rates
+from impactopt.transcription.layout import Affine, along, by_leg, rates
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.motion_phase import add_nodes, at_node
 from impactopt.transcription.objective import Prices, wrench_prices

@@ -29,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from impactopt.arrays import Array, Index
 from impactopt.codegen.batched import BatchedFunction
 from impactopt.codegen.compiler import address, native_library
 from impactopt.errors import InputError
@@ -36,7 +37,7 @@ from impactopt.kinematics.coordinates import solve_in_order
 from impactopt.kinematics.stages import Stage
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Block
-from impactopt.transcription.layout import Affine, Array, Constraints, Index, Layout, stack
+from impactopt.transcription.layout import Affine, Constraints, Layout, stack
 
 
 def derivatives(z: Any, out: Any, weights: Any, stages: Sequence[Stage] = ()) -> list[Any]:

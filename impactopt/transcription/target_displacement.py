@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from impactopt.arrays import Array
 from impactopt.problem.violation import Place, millimetres
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.frozen_collision import InstantImpact
-from impactopt.transcription.layout import Affine, Array, Group
+from impactopt.transcription.layout import Affine, Group
 
 TERM = "displacement of the target"
 # [m] Unit of the variables. An error of an early step, of a metre, must not outweigh all other constraints.

@@ -18,6 +18,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from impactopt.arrays import Array, Index
 from impactopt.codegen.cache import FunctionGroup, cached_groups, model_hash
 from impactopt.contact.friction import moves_target
 from impactopt.kinematics.coordinates import StanceCoordinates
@@ -35,7 +36,7 @@ from impactopt.transcription.contact_conditions import add_balance, add_clearanc
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, add_coasting
-from impactopt.transcription.layout import Affine, Array, Group, Index, Turn, along, determined, rates
+from impactopt.transcription.layout import Affine, Group, Turn, along, determined, rates
 from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares
 from impactopt.transcription.motion_phase import AbortMotion, FollowThrough, Swing, add_nodes
 from impactopt.transcription.objective import Prices, assemble, cost_of_motion, motion_prices

@@ -21,8 +21,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
+from impactopt.arrays import Index
 from impactopt.errors import InputError
-from impactopt.solvers.elimination.kernels import EliminationStage, Index, Kernels, Places, Products
+from impactopt.solvers.elimination.kernels import EliminationStage, Kernels, Places, Products
 from impactopt.solvers.program import PATTERN_CHANGED, Determined, Matrix, Vector
 
 

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.solvers.elimination.condense import Condenser, Mask, find_eliminations
-from impactopt.solvers.elimination.kernels import Index, Kernels, Panels, Places, Products
+from impactopt.arrays import Index, Mask
+from impactopt.solvers.elimination.condense import Condenser, find_eliminations
+from impactopt.solvers.elimination.kernels import Kernels, Panels, Places, Products
 from impactopt.solvers.elimination.kernels import kernels as fastest_kernels
 from impactopt.solvers.program import Determined, Matrix, Vector
 

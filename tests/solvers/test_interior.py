@@ -276,6 +276,17 @@ def test_a_constraint_without_bounds_changes_no_infeasible_program():
         assert 1.0 - 1e-3 <= np.sum(result.x**2) <= 5.0 + 1e-3
 
 
+@pytest.mark.parametrize("x0", [0.0, 1.0, 5.0])
+def test_a_least_sum_of_violations_is_infeasible_where_the_largest_one_is_less_elsewhere(x0):
+    """x >= 1 and 300 times 0.008 x <= 0: the sum is least at 0, the largest one near 1, 120 times smaller."""
+    rows = [(1.0, 1.0, INF), *[(-INF, 0.008, 0.0)] * 300]
+    program = Textbook(
+        1, lambda x: x**2, lambda x: [(low, of * x, high) for low, of, high in rows], lower=-10, upper=10
+    )
+    result = solve_ipm(program, [x0])
+    assert result.status is Status.INFEASIBLE
+
+
 def test_too_many_changes_of_the_aim_are_a_failure(monkeypatch):
     """Elastic constraints that are met would become hard, and may not: the solve must not go on in place."""
     monkeypatch.setattr(interior_point, "_SHORT_STEP", 2.0)

@@ -149,13 +149,13 @@ class _CauseSearch:
             causes += self._clearances(candidates, x)
         if not any(cause.problem for cause in causes):
             causes += self._stiffness()
+        # Stable: those that would do come first, in the order found.
+        causes.sort(key=lambda cause: cause.problem is None)
         # A motion within a changed bound may lead to one within the given ones: then nothing had to change.
         for near in self._near[:1]:
             result = self._run(self.t.program, start_of(self.t, *near), _ITERATIONS_SINGLE)
             if result is not None and not _penetrates(self.t, result.x):
-                return Search(met=(self.t, result.x))
-        # Stable: those that would do come first, in the order found.
-        causes.sort(key=lambda cause: cause.problem is None)
+                return Search(causes=tuple(causes), met=(self.t, result.x))
         return Search(causes=tuple(causes))
 
     def _all_relaxed(self) -> tuple[Array, Array] | None:

@@ -396,7 +396,7 @@ def _diagnosed(
     budget.say("a motion that meets all bounds was found: solving from it")
     program, x = found.met
     new = solver.from_guess(Guess(program=program, start=x))
-    return (outcome.then(new, "a motion within all bounds") if new.usable else outcome), ()
+    return (outcome.then(new, "a motion within all bounds"), ()) if new.usable else (outcome, found.causes)
 
 
 def _guesses(

@@ -124,8 +124,8 @@ class _CauseSearch:
         # initial guesses: the failed solve's last point, and the problem's own with typical durations
         self.guesses = own, first_iterate(program_for(self.t, typical))
         self.bounds = bounds_of(self.t)
-        # programs of the problem with one bound changed, and their solutions (n,)
-        self._near: list[tuple[Transcription, Array]] = []
+        # program of the problem with a bound changed that makes it feasible, and its solution (n,)
+        self._near: tuple[Transcription, Array] | None = None
 
     def found(self) -> Search:
         relaxed = self._all_relaxed()
@@ -152,8 +152,8 @@ class _CauseSearch:
         # Stable: those that would do come first, in the order found.
         causes.sort(key=lambda cause: cause.problem is None)
         # A motion within a changed bound may lead to one within the given ones: then nothing had to change.
-        for near in self._near[:1]:
-            result = self._run(self.t.program, start_of(self.t, *near), _ITERATIONS_SINGLE)
+        if self._near is not None:
+            result = self._run(self.t.program, start_of(self.t, *self._near), _ITERATIONS_SINGLE)
             if result is not None and not _penetrates(self.t, result.x):
                 return Search(causes=tuple(causes), met=(self.t, result.x))
         return Search(causes=tuple(causes))
@@ -184,7 +184,7 @@ class _CauseSearch:
             self._iterations += _ITERATIONS_CHANGED
             solution = self._solution(one.problem, _ITERATIONS_CHANGED)
             if solution is not None and not _penetrates(*solution):
-                self._near.append(solution)
+                self._near = self._near or solution
                 return replace(one, nearer=None)
         return replace(cause, nearer=None) if cause.problem is None else None
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.arrays import Array
-from impactopt.contact.fields import Described, Parameters, about, check_numbers
+from impactopt.contact.fields import Described, Parameters, about, check_numbers, described
 from impactopt.contact.targets.base import Target
 from impactopt.errors import InputError
 
@@ -43,18 +43,14 @@ class ContactFriction(Described):
     """
 
     coefficient: float = field(metadata=about("Coulomb friction of the striking point", above=0, most=10))
-    slip_speed: float = field(
-        default=0.1,
-        metadata=about(
-            "slide at which friction is 0.7 of the full one; less is stiffer", unit="m/s", above=0
-        ),
+    slip_speed: float = described(
+        0.1, "slide at which friction is 0.7 of the full one; less is stiffer", unit="m/s", above=0
     )
-    stiffness: float = field(
-        default=0.0,
-        metadata=about("stiffness of the bristles across the normal; 0: none", unit="N/m", least=0),
+    stiffness: float = described(
+        0.0, "stiffness of the bristles across the normal; 0: none", unit="N/m", least=0
     )
-    moves_target: bool = field(
-        default=False, metadata=about("true: a free mass is also pushed across the normal, as a point mass")
+    moves_target: bool = described(
+        False, "true: a free mass is also pushed across the normal, as a point mass"
     )
 
     def __post_init__(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.contact.fields import Described, about, abouts
+from impactopt.contact.fields import Described, abouts, described
 from impactopt.errors import FARTHEST, InputError, check_choice
 from impactopt.robots.checks import HEAVIEST, STRONGEST
 
@@ -25,7 +25,7 @@ MAX_BANDWIDTH, MAX_DELAY = 1e6, 1.0  # [Hz], [s]: larger ones are mistakes, such
 
 def _optional(what: str, unit: str, **limits: float) -> Any:
     """A field that is None if it is not known."""
-    return field(default=None, metadata=about(what, unit=unit, **limits))
+    return described(None, what, unit=unit, **limits)
 
 
 _NOT_NEGATIVE, _POSITIVE = {"least": 0, "most": STRONGEST}, {"above": 0, "most": STRONGEST}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from impactopt.contact.fields import Parameters, about, power
+from impactopt.contact.fields import Parameters, about, described, power
 from impactopt.contact.laws.base import ContactLaw
 
 
@@ -23,7 +23,7 @@ class HuntCrossley(ContactLaw):
     word: ClassVar[str] = "Hunt-Crossley"
     stiffness: float = field(metadata=about("stiffness k; p is the exponent", unit="N/m^p", above=0))
     dissipation: float = field(metadata=about("dissipation alpha", unit="s/m", least=0))
-    exponent: float = field(default=1.5, metadata=about("exponent p; 1.5 for a sphere on a plane", least=1))
+    exponent: float = described(1.5, "exponent p; 1.5 for a sphere on a plane", least=1)
 
     def branch(
         self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from impactopt.contact.fields import Parameters, about, choose, function
+from impactopt.contact.fields import Parameters, about, choose, described, function
 from impactopt.contact.targets.base import Target
 
 MARGIN = 0.1  # relative to the breaking force, at the touch; zero at the break
@@ -30,12 +30,9 @@ class Board(Target):
     mass: float = field(metadata=about("modal mass at the hit point", unit="kg", above=0))
     stiffness: float = field(metadata=about("stiffness of the bending", unit="N/m", above=0))
     breaking_force: float = field(metadata=about("spring force at which it breaks", unit="N", above=0))
-    damping: float = field(default=0.0, metadata=about("damping of the bending", unit="N s/m", least=0))
-    initial_velocity: float = field(
-        default=0.0,
-        metadata=about(
-            "velocity along the normal before contact; below zero: towards the striker", unit="m/s"
-        ),
+    damping: float = described(0.0, "damping of the bending", unit="N s/m", least=0)
+    initial_velocity: float = described(
+        0.0, "velocity along the normal before contact; below zero: towards the striker", unit="m/s"
     )
 
     n_states = 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from impactopt.contact.fields import Parameters, about
+from impactopt.contact.fields import Parameters, about, described
 from impactopt.contact.targets.base import Target
 
 
@@ -19,11 +19,8 @@ class FreeMass(Target):
 
     word: ClassVar[str] = "free mass"
     mass: float = field(metadata=about("mass of the target", unit="kg", above=0))
-    initial_velocity: float = field(
-        default=0.0,
-        metadata=about(
-            "velocity along the normal before contact; below zero: towards the striker", unit="m/s"
-        ),
+    initial_velocity: float = described(
+        0.0, "velocity along the normal before contact; below zero: towards the striker", unit="m/s"
     )
 
     n_states = 1

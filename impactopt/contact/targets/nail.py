@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from impactopt.contact.fields import Parameters, about, choose
+from impactopt.contact.fields import Parameters, about, choose, described
 from impactopt.contact.targets.base import Target
 
 SOON, LEFT = 1e-3, 1e-4  # time scale [s] and relaxation of the complementarity condition in `Nail.guard`
@@ -28,12 +28,8 @@ class Nail(Target):
     word: ClassVar[str] = "nail"
     mass: float = field(metadata=about("mass of the nail", unit="kg", above=0))
     resistance: float = field(metadata=about("resistance of the wood at its surface", unit="N", above=0))
-    hardening: float = field(
-        default=0.0, metadata=about("growth of the resistance with depth", unit="N/m", least=0)
-    )
-    depth: float = field(
-        default=0.0, metadata=about("how deep it is in the wood before the blow", unit="m", least=0)
-    )
+    hardening: float = described(0.0, "growth of the resistance with depth", unit="N/m", least=0)
+    depth: float = described(0.0, "how deep it is in the wood before the blow", unit="m", least=0)
 
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("depth",)

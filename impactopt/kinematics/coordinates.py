@@ -30,7 +30,7 @@ from impactopt.arrays import Array, Index, Mask
 from impactopt.errors import InputError
 from impactopt.robots.build import joint_indices
 from impactopt.robots.checks import LEG, check_arms, check_legs
-from impactopt.robots.model import JointAngles
+from impactopt.robots.model import JointAngles, RpyCoordinates
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.tools import check_held
@@ -288,7 +288,7 @@ class StanceCoordinates:
         """posture (nq,) : Pinocchio configuration; its placements of soles and hands are the fixed ones."""
         self.robot, self.soles, self.posture = robot, soles, posture
         self.model, self.data = robot.model, robot.model.createData()
-        self.base = 6 if robot.floating else 0
+        self.base, self._rpy = 6 if robot.floating else 0, RpyCoordinates(self.model)
         check_legs(self.model, [(sole.name, sole.frame) for sole in soles])
         lifted = [sole.name for sole in robot.soles if sole.hinge is not None and sole not in soles]
         if lifted:
@@ -554,8 +554,8 @@ class StanceCoordinates:
         Angles without limits are the equivalent ones nearest to those of the given posture. Else a robot
         whose root faces backwards, with a yaw of pi, would turn round once in a motion across it.
         """
-        q = self.rb.from_pin(q_pin)
-        turns = 2 * np.pi * np.round((self.rb.from_pin(self.posture) - q) / (2 * np.pi))
+        q = self._rpy.from_pin(q_pin)
+        turns = 2 * np.pi * np.round((self._rpy.from_pin(self.posture) - q) / (2 * np.pi))
         q = q + np.where(self._unlimited, turns, 0.0)
         joints = q[self.base :]
         return np.concatenate([q[: self.base], joints[self.independent]]), joints[self.dependent]
@@ -571,7 +571,7 @@ class StanceCoordinates:
         """Pinocchio configuration (nq,) of y (ny,) and legs (nl,), or (k, nq) of k of them."""
         joints = np.zeros((*y.shape[:-1], self.robot.n))
         joints[..., self.independent], joints[..., self.dependent] = y[..., self.base :], legs
-        return self.rb.to_pin(np.concatenate([y[..., : self.base], joints], axis=-1))
+        return self._rpy.to_pin(np.concatenate([y[..., : self.base], joints], axis=-1))
 
     def solve_legs(self, y: Array, guess: Array) -> Array:
         """Leg joints (nl,) that put every fixed sole in its place, by Newton's method from ``guess``.

@@ -1,4 +1,4 @@
-"""Values of a `pin.Model`: joint angles in its configurations, mass matrix, axes and placements of joints.
+"""Values of a `pin.Model`: coordinates of its configurations, mass matrix, axes and placements of joints.
 
 Pinocchio has the cosine and sine of a continuous joint in place of its angle, and its mass matrix lacks some
 entries of followers. Its forward kinematics takes 5 us per configuration, but copying the placements to
@@ -46,6 +46,41 @@ class JointAngles:
             at = self._place[k]
             q[..., at], q[..., at + 1] = np.cos(angles[..., k]), np.sin(angles[..., k])
         return q
+
+
+class RpyCoordinates:
+    """Coordinates of a model with one for each velocity: base position, roll, pitch, yaw, and joint angles.
+
+    Without a free-flyer they are the joint angles alone.
+    """
+
+    def __init__(self, model: pin.Model) -> None:
+        joints = list(model.joints)[1:]
+        self._nq, self._base = model.nq, 6 if joints and joints[0].nv == 6 else 0
+        self._angles = JointAngles([joint for joint in joints if joint.nv == 1])
+
+    def from_pin(self, q: Array) -> Array:
+        """Coordinates (nv,) of Pinocchio's configuration (nq,); angles of continuous joints in [-pi, pi]."""
+        angles = self._angles.of(q)
+        if not self._base:
+            return angles
+        return np.concatenate([q[:3], pin.rpy.matrixToRpy(pin.XYZQUATToSE3(q[:7]).rotation), angles])
+
+    def to_pin(self, coordinates: Array) -> Array:
+        """Pinocchio's configurations (..., nq) of coordinates (..., nv)."""
+        q = np.empty((*coordinates.shape[:-1], self._nq))
+        if self._base:
+            half_angles = np.moveaxis(coordinates[..., 3:6] / 2, -1, 0)
+            q[..., :3], q[..., 3:7] = coordinates[..., :3], _quaternions(*half_angles)
+        return self._angles.put(q, coordinates[..., self._base :])
+
+
+def _quaternions(roll: Array, pitch: Array, yaw: Array) -> Array:
+    """Quaternions (..., 4), scalar last and not negative, of Rz(2 yaw) Ry(2 pitch) Rx(2 roll) [rad]."""
+    (cr, cp, cy), (sr, sp, sy) = (tuple(map(f, (roll, pitch, yaw))) for f in (np.cos, np.sin))
+    parts = (sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy)
+    out = np.stack([*parts, cr * cp * cy + sr * sp * sy], axis=-1)
+    return np.where(out[..., 3:] < 0.0, -out, out)
 
 
 def principal_moments(inertia: ArrayLike) -> tuple[Array, Array, Array]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -22,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean, shortened
 from impactopt.robots.checks import check_configuration
-from impactopt.robots.model import JointAngles, axis_of
+from impactopt.robots.model import RpyCoordinates, axis_of
 from impactopt.robots.rigid_body._spatial import (
     IDENTITY,
     Matrix,
@@ -401,40 +400,15 @@ class Coordinates:
         return [[1.0, sr * t, cr * t], [0.0, cr, 0.0 - sr], [0.0, sr / cp, cr / cp]]
 
     # ------------------------------------------------------------ numeric
-    @cached_property
-    def _angles(self) -> JointAngles:
-        """Angles of the joints in Pinocchio's q, in the order of v; cached, as replays need them often."""
-        return JointAngles([joint for joint in list(self.tree.model.joints)[1:] if joint.nv == 1])
-
     def from_pin(self, q: ArrayLike) -> NDArray[np.float64]:
         """These coordinates (nq,) of Pinocchio's q; angles of continuous joints in (-pi, pi]."""
         q = check_configuration(self.tree.model, q, "q (pinocchio)")
-        if self.base == "quaternion":
-            return q
-        if not self.tree.floating:
-            return self._angles.of(q)
-        return np.concatenate(
-            [q[:3], pin.rpy.matrixToRpy(pin.XYZQUATToSE3(q[:7]).rotation), self._angles.of(q)]
-        )
+        return q if self.base == "quaternion" else RpyCoordinates(self.tree.model).from_pin(q)
 
     def to_pin(self, q: ArrayLike) -> NDArray[np.float64]:
         """Pinocchio's q, (..., model.nq), of one configuration (nq,) or of several (k, nq)."""
         q = check_array("q", q, (self.nq,) if np.ndim(q) < 2 else (None, self.nq))
-        if self.base == "quaternion":
-            return q
-        out = np.empty((*q.shape[:-1], self.tree.nq))
-        if self.tree.floating:
-            half_angles = np.moveaxis(q[..., 3:6] / 2, -1, 0)
-            out[..., :3], out[..., 3:7] = q[..., :3], _quaternion(*half_angles)
-        return self._angles.put(out, q[..., 6 if self.tree.floating else 0 :])
-
-
-def _quaternion(roll: Any, pitch: Any, yaw: Any) -> NDArray[np.float64]:
-    """Quaternion (..., 4), scalar last and not negative, of Rz(2 yaw) Ry(2 pitch) Rx(2 roll) [rad]."""
-    (cr, cp, cy), (sr, sp, sy) = (tuple(map(f, (roll, pitch, yaw))) for f in (np.cos, np.sin))
-    parts = (sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy)
-    out = np.stack([*parts, cr * cp * cy + sr * sp * sy], axis=-1)
-    return np.where(out[..., 3:] < 0.0, -out, out)
+        return q if self.base == "quaternion" else RpyCoordinates(self.tree.model).to_pin(q)
 
 
 def _quaternion_matrix(x: Scalar, y: Scalar, z: Scalar, w: Scalar) -> Matrix:

@@ -227,7 +227,8 @@ class ContactProgram(ABC):
     # ------------------------------------------------------------------ the program
     def _finish(self, terms: tuple[Term, ...], objectives: tuple[Objective, ...]) -> None:
         """Add the constraints of springs, hinges and terms, and assemble the objective."""
-        add_springs(self.builder, self._spring_points(), self.hit.contact.gains[0])
+        if self.builder.robot.sprung.any():
+            add_springs(self.builder, self._spring_points(), self.hit.contact.gains[0])
         if self.builder.robot.hinges.any():
             add_hinges(self.builder, [(place, torque) for place, torque, _ in self._nodes()])
         # after the contact's constraints, which determine the target's motion

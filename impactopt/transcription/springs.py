@@ -118,10 +118,7 @@ def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> Non
     gains : logarithms of factors on stiffness and damping, if these are variables.
     """
     robot, c = b.robot, b.coordinates
-    passive = np.flatnonzero(robot.sprung)
-    if not passive.size:
-        return
-    own = c.independent
+    passive, own = np.flatnonzero(robot.sprung), c.independent
     stiffness, damping = ((gain / robot.torque_limit)[own] for gain in (robot.kp, robot.kd))
     slots: list[list[Any]] = [[point.y, point.y1, point.T, gains] for point in points]
     at = b.add_block("spring", slots, np.concatenate([b.y0[c.base :], stiffness, damping]))

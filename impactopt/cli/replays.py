@@ -10,11 +10,11 @@ from impactopt.errors import InputError, missing_package
 from impactopt.files.output import record_of
 from impactopt.files.problem_file import ProblemFile
 from impactopt.files.record import Record
-from impactopt.files.replay import has_mujoco
 from impactopt.planning.budget import VIOLATED
 from impactopt.planning.minimum_jerk import minimum_jerk_baseline
 from impactopt.planning.solution import Solution
 from impactopt.report.console import SolveConsole
+from impactopt.simulation.engines import has_mujoco
 from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.solvers.program import Status
 

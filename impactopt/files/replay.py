@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib.util
 import json
 import os
 import warnings
@@ -150,11 +149,6 @@ class Replay:
     simulation: Simulation
     report: dict[str, Any]
     record: Record
-
-
-def has_mujoco() -> bool:
-    """True if the engine "mujoco" is installed."""
-    return importlib.util.find_spec("mujoco") is not None
 
 
 def load_planned(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -25,6 +26,11 @@ from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.pinocchio_robot import recursive_body
 from impactopt.simulation.result import FACE, Scene, Simulation, state_at_contact
 from impactopt.transcription.plan import Trajectory
+
+
+def has_mujoco() -> bool:
+    """True if the engine "mujoco" is installed."""
+    return importlib.util.find_spec("mujoco") is not None
 
 
 def scene_of(problem: ImpactProblem) -> Scene:

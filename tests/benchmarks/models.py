@@ -14,10 +14,10 @@ from benchmarks.report import Report, Say, columns_table
 from impactopt import Solution
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
-from impactopt.files.replay import has_mujoco
 from impactopt.planning.solve import solve
 from impactopt.problem.checks import INSTANT
 from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.engines import has_mujoco
 
 # a long push, a stiff hammer's blow, a light humanoid, an arm
 PROBLEMS = ("punch", "nailing", "punch_g1", "arm7")

@@ -22,7 +22,7 @@ from impactopt.planning.clearance_constraints import (
 from impactopt.planning.contact_replay import ACCEPTABLE_WITHIN, SOLVED_WITHIN
 from impactopt.planning.diagnosis import MAX_NAMED, lost_in_contact
 from impactopt.planning.refinement import Additions, Guess, Outcome, program_for, refine, start_of
-from impactopt.problem.motion_style import MotionPrices
+from impactopt.problem.objectives import MotionPrices
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.contact_refinement import TOLERANCE_PCT, all_halved, finest, refined_elements
 from impactopt.transcription.initial_guess import first_iterate

@@ -48,7 +48,7 @@ from impactopt.planning.refinement import Guess, Oracle, Outcome, refine
 from impactopt.planning.solution import Solution, program_of, program_on, solution_of
 from impactopt.planning.strike import clear_strike
 from impactopt.problem.feasibility import blocked, hopeless
-from impactopt.problem.motion_style import MotionPrices
+from impactopt.problem.objectives import MotionPrices
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import drawn_posture
 from impactopt.solvers.program import Callback, SolverResult, Status

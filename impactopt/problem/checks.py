@@ -34,8 +34,7 @@ from impactopt.errors import (
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import margin, shrink, support_polygon
-from impactopt.problem.motion_style import STYLES
-from impactopt.problem.objectives import Penetration, TargetEnergy
+from impactopt.problem.objectives import STYLES, Penetration, TargetEnergy
 from impactopt.problem.terms import ContactWrenchCone, Grip, JointJerk, MotorCurve, PowerLimit, Term
 from impactopt.robots.actuators import numbers_of
 from impactopt.robots.checks import LEG, check_arms

@@ -1,4 +1,5 @@
-"""Objectives of a plan: quantities whose weighted sum is maximized; the impulse by default.
+"""Objectives of a plan: quantities whose weighted sum is maximized, the impulse by default. Motion styles:
+prices on the motion that keep plans smooth and near the start posture.
 
 A weight converts a quantity's unit to N s, so that objectives compare: with TargetEnergy(weight=0.5) beside
 Impulse(), one more joule in the target counts as half a newton second. A new objective is a class here, and
@@ -8,7 +9,7 @@ is listed at the end.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -285,6 +286,33 @@ def trapezoid(nodes: Array) -> Array:
     return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
 
 
+@dataclass(frozen=True, kw_only=True)
+class MotionPrices:
+    """Prices of a whole motion. All but ``end`` are on the integral of a square over swing and
+    follow-through.
+
+    acceleration [N s per (rad/s^2)^2 s], jerk [N s per (rad/s^3)^2 s] : of all independent coordinates.
+    speed, idle_speed [N s per (rad/s)^2 s] : of all independent coordinates, and of idle joints in addition.
+    end [N s per rad^2] : on the squared distance of the end posture from the start posture.
+    """
+
+    acceleration: float = 0.0
+    jerk: float = 0.0
+    speed: float = 0.0
+    idle_speed: float = 0.0
+    end: float = 0.0
+
+    def scaled(self, factor: float) -> MotionPrices:
+        """All prices multiplied by a factor."""
+        return replace(self, **{name: factor * value for name, value in vars(self).items()})
+
+
+# Chosen for `punch` (figures: docs/howto/natural.md). The price on jerk removes reversals and peaks, that on
+# idle speed the motion of limbs that do not contribute, that on speed the detours of all others.
+STYLES: dict[str, MotionPrices] = {
+    "natural": MotionPrices(jerk=7e-7, speed=7.5e-3, idle_speed=8e-2, end=2.0),
+    "strongest": MotionPrices(),
+}
 DEFAULT_OBJECTIVES: tuple[Objective, ...] = (Impulse(),)
 # all objectives of problem files, in their order
 OBJECTIVES: tuple[type[Objective], ...] = (

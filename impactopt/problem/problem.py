@@ -36,8 +36,7 @@ from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance, 
 from impactopt.problem import checks
 from impactopt.problem.checks import COLLISIONS, INSTANT
 from impactopt.problem.hashing import problem_hash
-from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
-from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
+from impactopt.problem.objectives import DEFAULT_OBJECTIVES, STYLES, MotionPrices, Objective, check_objectives
 from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
 from impactopt.problem.stances import StancePhase, check_stances, impact_phase, names_of, phase_coordinates
 from impactopt.problem.terms import (
@@ -54,6 +53,7 @@ from impactopt.problem.terms import (
 )
 from impactopt.problem.terms.base import check_known, kind_of
 from impactopt.robots.attachments import Sole
+from impactopt.robots.build import joints_to
 from impactopt.robots.gains import GainFactor
 from impactopt.robots.robot import Robot
 
@@ -109,7 +109,7 @@ class ImpactProblem:
         ones of ON_DEMAND_TERMS, whose constraints enter once a plan violates them.
     objectives : their weighted sum is maximized.
     style : "natural", with prices on jerk, on the motion of joints, above all of idle ones, and on the
-        distance of the end posture from the start (`impactopt.problem.motion_style`); or "strongest", without
+        distance of the end posture from the start (`impactopt.problem.objectives`); or "strongest", without
         prices.
     motion_price : largest share of all prices on motion in the objective; those of the style are reduced to
         it.  price_scale : factor on these; 1: the planner chooses it.
@@ -276,10 +276,14 @@ class ImpactProblem:
 
     @cached_property
     def idle_joints(self) -> Mask:
-        """Mask (n,) of the joints that move no striker, no sole on the ground and no supporting hand."""
+        """Mask (n,) of the joints that move no striker, no sole on the ground and no supporting hand, such as
+        those of an idle arm or the head.
+        """
+        model = self.robot.model
         strikers = [self.robot.striker(name).model_frame for name in self.strikers]
         fixed = [*(leg.frame for leg in self.coordinates.legs), *(sole.frame for sole in self.soles)]
-        return idle_joints(self.robot, [*strikers, *fixed])
+        moving = [model.joints[j].idx_v for j in joints_to(model, [*strikers, *fixed]) if j]
+        return ~np.isin(np.arange(model.nv - self.robot.n, model.nv), moving)
 
     @property
     def planned_touches(self) -> int:

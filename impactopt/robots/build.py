@@ -86,6 +86,12 @@ def parent_body(model: pin.Model, joint: int) -> int:
     return above
 
 
+def joints_to(model: pin.Model, frames: Iterable[str]) -> set[int]:
+    """Joints that move any of these frames, and 0, the world."""
+    joints = (model.frames[model.getFrameId(name)].parentJoint for name in frames)
+    return {int(j) for joint in joints for j in model.supports[joint]}
+
+
 def per_joint(
     what: str, value: float | Mapping[str, float] | ArrayLike | None, joints: Sequence[str], default: Array
 ) -> Array:

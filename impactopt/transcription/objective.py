@@ -16,8 +16,7 @@ import scipy.sparse as sp
 
 from impactopt.arrays import Array
 from impactopt.errors import InputError
-from impactopt.problem.motion_style import MotionPrices
-from impactopt.problem.objectives import Objective
+from impactopt.problem.objectives import MotionPrices, Objective
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Group, Layout, stack
 from impactopt.transcription.motion_phase import MotionPhase

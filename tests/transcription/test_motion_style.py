@@ -14,7 +14,7 @@ from support.small_robots import biped
 from impactopt import GroundForce, InputError, talos
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.planning.solution import ground_force_share, motion_measures
-from impactopt.problem.motion_style import STYLES, MotionPrices
+from impactopt.problem.objectives import STYLES, MotionPrices
 from impactopt.robots.loads import weight_of
 from impactopt.transcription.objective import cost_of_motion
 from impactopt.transcription.plan import Trajectory

@@ -13,11 +13,11 @@ from impactopt.arrays import Array
 from impactopt.bodies.solids import Solid, simplified
 from impactopt.bodies.visuals import LARGE, Part, surroundings_of
 from impactopt.files.record import Record
-from impactopt.problem.motion_style import joints_to
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures.style import BLUE, ORANGE, VERMILION, Picture, styled, title
 from impactopt.report.stage import bodies_drawn
 from impactopt.report.tracks import Track, tracks_of
+from impactopt.robots.build import joints_to
 
 CELL = 0.015  # [m] of the simplified meshes: a limb is 40 pixels wide
 WIDTH = 11.0  # [in]
@@ -126,8 +126,8 @@ def _chosen(track: Track) -> list[int]:
 def _solids(problem: ImpactProblem) -> list[Drawn]:
     """Solids of the robot: triangles of each joint, with their normals and colours."""
     robot = problem.robot
-    striking = joints_to(robot, [robot.striker(name).model_frame for name in problem.strikers])
-    standing = joints_to(robot, [sole.frame for sole in problem.stance.soles(robot)])
+    striking = joints_to(robot.model, [robot.striker(name).model_frame for name in problem.strikers])
+    standing = joints_to(robot.model, [sole.frame for sole in problem.stance.soles(robot)])
     out = []
     for body in bodies_drawn(robot):
         solid = simplified(body.solid, CELL) if len(body.solid.triangles) > 500 else body.solid

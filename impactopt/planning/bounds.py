@@ -16,7 +16,8 @@ from impactopt.contact.fields import abouts
 from impactopt.errors import InputError
 from impactopt.planning.parameter_changes import changed, with_term
 from impactopt.planning.refinement import program_for
-from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.phases import Phase
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,

@@ -34,8 +34,8 @@ from impactopt.planning.parameter_changes import changed, with_parameter
 from impactopt.planning.refinement import program_for, start_of
 from impactopt.problem.checks import met_once
 from impactopt.problem.feasibility import too_weak
+from impactopt.problem.phases import LONGEST, SHORTEST, Phase
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.scenario import LONGEST, SHORTEST, Phase
 from impactopt.problem.terms import Slide
 from impactopt.robots.loads import shortfalls
 from impactopt.robots.robot import Robot

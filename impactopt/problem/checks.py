@@ -34,8 +34,19 @@ from impactopt.errors import (
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import margin, shrink, support_polygon
-from impactopt.problem.objectives import STYLES, Penetration, TargetEnergy
-from impactopt.problem.terms import ContactWrenchCone, Grip, JointJerk, MotorCurve, PowerLimit, Term
+from impactopt.problem.objectives import STYLES, PeakForce, Penetration, TargetEnergy
+from impactopt.problem.scenario import SecondStriker
+from impactopt.problem.terms import (
+    ContactWrenchCone,
+    Grip,
+    HitCone,
+    HitRegion,
+    JointJerk,
+    MotorCurve,
+    PowerLimit,
+    Slide,
+    Term,
+)
 from impactopt.robots.actuators import numbers_of
 from impactopt.robots.checks import LEG, check_arms
 from impactopt.robots.gains import GainFactor, scaled_gains
@@ -187,6 +198,32 @@ def check_jerk(problem: Any) -> None:
                 f"JointJerk.limit: {joint!r} is determined by the other joints and a fixed sole or hand; "
                 "leave it out"
             )
+
+
+def check_second(problem: Any) -> None:
+    """InputError for a second striker that does not fit the rest of a problem."""
+    p, robot, second = problem, problem.robot, problem.second
+    if second is None:
+        return
+    if not isinstance(second, SecondStriker):
+        raise InputError(f"second must be a SecondStriker, not {second!r}")
+    # each needs a joint that does not move the other
+    one, other = (set(robot.limb(robot.striker(s).model_frame)) for s in (p.striker, second.striker))
+    if not (one - other and other - one):
+        raise InputError(
+            f"the second striker {second.striker!r} moves with {p.striker!r}: give one on a limb of its own"
+        )
+    if p.collision != "full":
+        raise InputError(f'two strikers need collision="full", not {p.collision!r}')
+    if not isinstance(p.target, (FreeMass, RigidWall)):
+        raise InputError(
+            f"two strikers hit a FreeMass or a RigidWall, not a {type(p.target).__name__}, which takes one"
+        )
+    for thing in (*(term for term in p.terms if term.active), *p.objectives):
+        if isinstance(thing, (HitCone, HitRegion, Slide, PeakForce, Penetration)) or (
+            getattr(thing, "first_instant", False)
+        ):
+            raise InputError(f"{type(thing).__name__} is for one striker: leave it out, or the second one")
 
 
 def check_strikers(problem: Any) -> None:

@@ -37,8 +37,15 @@ from impactopt.problem import checks
 from impactopt.problem.checks import COLLISIONS, INSTANT
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, STYLES, MotionPrices, Objective, check_objectives
-from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
-from impactopt.problem.stances import StancePhase, check_stances, impact_phase, names_of, phase_coordinates
+from impactopt.problem.phases import (
+    Phase,
+    StancePhase,
+    check_stances,
+    impact_phase,
+    names_of,
+    phase_coordinates,
+)
+from impactopt.problem.scenario import Scenario, SecondStriker
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
@@ -199,7 +206,7 @@ class ImpactProblem:
             mistakes.attempt(partial(checks.check_motors, self))
         if mistakes.attempt(self._check_objectives) and collision:
             mistakes.attempt(partial(checks.check_energy, self))
-        sound = striker and stance and terms and mistakes.attempt(partial(check_second, self))
+        sound = striker and stance and terms and mistakes.attempt(partial(checks.check_second, self))
         if sound:
             mistakes.attempt(partial(checks.check_hands, self))
             mistakes.attempt(partial(checks.check_hinges, self))

@@ -1,16 +1,15 @@
-"""Phases of a motion, scenarios of other targets, and a second striker."""
+"""Scenarios of other targets, and a second striker."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
 
 import numpy as np
 
 from impactopt.arrays import Array
 from impactopt.contact.fields import Described, about, abouts, described
 from impactopt.contact.laws import ContactLaw
-from impactopt.contact.targets import FreeMass, RigidWall, Target
+from impactopt.contact.targets import Target
 from impactopt.contact.targets.base import scaled_numbers
 from impactopt.errors import (
     FARTHEST,
@@ -18,12 +17,7 @@ from impactopt.errors import (
     check_array,
     check_kind,
     check_name,
-    check_number,
-    raw_array,
-    shortened,
 )
-from impactopt.problem.objectives import PeakForce, Penetration
-from impactopt.problem.terms import HitCone, HitRegion, Slide
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,74 +58,7 @@ class SecondStriker:
         )
 
 
-def check_second(problem: Any) -> None:
-    """InputError for a second striker that does not fit the rest of a problem."""
-    p, robot, second = problem, problem.robot, problem.second
-    if second is None:
-        return
-    if not isinstance(second, SecondStriker):
-        raise InputError(f"second must be a SecondStriker, not {second!r}")
-    # each needs a joint that does not move the other
-    one, other = (set(robot.limb(robot.striker(s).model_frame)) for s in (p.striker, second.striker))
-    if not (one - other and other - one):
-        raise InputError(
-            f"the second striker {second.striker!r} moves with {p.striker!r}: give one on a limb of its own"
-        )
-    if p.collision != "full":
-        raise InputError(f'two strikers need collision="full", not {p.collision!r}')
-    if not isinstance(p.target, (FreeMass, RigidWall)):
-        raise InputError(
-            f"two strikers hit a FreeMass or a RigidWall, not a {type(p.target).__name__}, which takes one"
-        )
-    for thing in (*(term for term in p.terms if term.active), *p.objectives):
-        if isinstance(thing, (HitCone, HitRegion, Slide, PeakForce, Penetration)) or (
-            getattr(thing, "first_instant", False)
-        ):
-            raise InputError(f"{type(thing).__name__} is for one striker: leave it out, or the second one")
-
-
-# [s] of a phase: no servo is faster; an impact's motion takes about a second, and more is milliseconds
-SHORTEST, LONGEST = 1e-3, 60.0
 LONGEST_WAIT = 10.0  # [s] until an abort motion
-# intervals of a phase: with the middles of the intervals, a swing of 1 s has nodes at 4 kHz, as a fast servo
-FINEST = 2000
-STEEPEST = 1e3  # grading
-
-
-@dataclass(frozen=True, kw_only=True)
-class Phase:
-    """Phase of the motion: duration and spline.
-
-    ``duration`` [s] : (shortest, longest), or one number.  ``intervals`` : number of the spline's intervals.
-    ``grading`` : longest interval over the shortest one; the short ones are at the contact. The program's
-    nodes are the ends and the middles of the intervals.
-    """
-
-    duration: tuple[float, float]
-    intervals: int = 12
-    grading: float = 3.0
-
-    def __post_init__(self) -> None:
-        one = raw_array("a phase's duration [s]", self.duration).ndim == 0
-        given: Any = (self.duration,) * 2 if one else self.duration
-        duration = check_array("a phase's duration [s]", given, (None,)).tolist()
-        if len(duration) != 2 or not SHORTEST <= duration[0] <= duration[1] <= LONGEST:
-            doubt = "; is it in milliseconds?" if max(duration, default=0.0) > LONGEST else ""
-            raise InputError(
-                f"a phase's duration [s] is a number of {SHORTEST:g} to {LONGEST:g} or (shortest, longest), "
-                f"not {shortened(str(self.duration))}{doubt}"
-            )
-        object.__setattr__(self, "duration", tuple(duration))
-        object.__setattr__(self, "grading", check_number("a phase's grading", self.grading))
-        if not 1 <= self.grading <= STEEPEST:
-            raise InputError(f"a phase's grading must be 1 to {STEEPEST:g}, not {self.grading:g}")
-        intervals = check_number("a phase's intervals", self.intervals)
-        if not 6 <= intervals <= FINEST or intervals != round(intervals):
-            raise InputError(
-                f"a phase needs 6 to {FINEST} spline intervals, a whole number, not "
-                f"{shortened(str(self.intervals))}"
-            )
-        object.__setattr__(self, "intervals", round(intervals))
 
 
 @dataclass(frozen=True, kw_only=True)

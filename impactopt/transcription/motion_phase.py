@@ -18,7 +18,7 @@ import numpy as np
 from impactopt.arrays import Array, Index
 from impactopt.kinematics.splines import CubicSpline, basis, graded_breaks, knots, rate_weights
 from impactopt.kinematics.stance import contact_wrench_cone
-from impactopt.problem.problem import Phase
+from impactopt.problem.phases import Phase
 from impactopt.problem.violation import Measure, Place, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder

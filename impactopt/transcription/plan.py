@@ -21,8 +21,8 @@ from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates, base_rates, solved
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.stance import margin, support_polygon, zmp
+from impactopt.problem.phases import places_of_soles
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.stances import places_of_soles
 from impactopt.problem.terms import ContactWrenchCone, GearLoad
 from impactopt.robots.loads import (
     MIN_LOAD_FRACTION,

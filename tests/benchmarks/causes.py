@@ -18,8 +18,8 @@ from benchmarks.report import Report, Say, columns_table
 from impactopt.errors import check_whole
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.solve import solve
+from impactopt.problem.phases import Phase
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.scenario import Phase
 from impactopt.problem.terms import TorqueLimit
 
 PROBLEMS = ("arm_planar", "arm7", "chop_arm")

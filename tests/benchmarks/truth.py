@@ -26,7 +26,8 @@ from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.planning.solve import solve
-from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.phases import Phase
+from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.presets import talos
 from impactopt.simulation.perturbation import Perturbation
 

@@ -39,7 +39,7 @@ from impactopt.files.named_problems import problem_file
 from impactopt.files.problem_file import read_problem_file
 from impactopt.files.sections.diagnostics import key_lines
 from impactopt.files.sections.reading import parse_settings
-from impactopt.problem.scenario import FINEST
+from impactopt.problem.phases import FINEST
 from impactopt.report.page import html_page
 from impactopt.simulation import simulate
 from impactopt.solvers.ipm.newton import elimination_blocks

@@ -11,8 +11,8 @@ from scipy.interpolate import BSpline
 
 from impactopt.kinematics.splines import graded_breaks, knots
 from impactopt.kinematics.stance import contact_wrench_cone
+from impactopt.problem.phases import Phase
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.scenario import Phase
 from impactopt.problem.terms import (
     ContactWrenchCone,
     Grip,

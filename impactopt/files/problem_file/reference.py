@@ -20,7 +20,7 @@ from impactopt.files.sections.reading import LONGEST_KEY
 from impactopt.files.sections.values import Section
 from impactopt.files.toml import DEEPEST, LONGEST_TEXT, Place, plain_value, write_toml
 from impactopt.problem.checks import LONGEST_CONTACT, MOST_ELEMENTS
-from impactopt.problem.scenario import FINEST, LONGEST, SHORTEST, STEEPEST
+from impactopt.problem.phases import FINEST, LONGEST, SHORTEST, STEEPEST
 from impactopt.robots.checks import HEAVIEST
 
 

@@ -33,7 +33,8 @@ from impactopt.files.sections.values import (
 )
 from impactopt.files.toml import Place
 from impactopt.problem.objectives import OBJECTIVES
-from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.phases import Phase
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario, SecondStriker
 from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS, TERMS
 from impactopt.simulation.controller import ControllerSettings

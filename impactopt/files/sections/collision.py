@@ -39,8 +39,7 @@ from impactopt.files.sections.values import (
 )
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, FixedBase, Free, OneSole, Stance
 from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
-from impactopt.problem.scenario import Phase
-from impactopt.problem.stances import StancePhase, impact_phase, phase_coordinates, stance_at_impact
+from impactopt.problem.phases import Phase, StancePhase, impact_phase, phase_coordinates, stance_at_impact
 from impactopt.robots.robot import Robot
 
 TargetKind: Any = one_of(kind.word for kind in targets.TARGETS)

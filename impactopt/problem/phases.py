@@ -1,4 +1,4 @@
-"""Stance phases of a motion: the soles that stand in each, and their steps."""
+"""Phases of a motion: durations and splines; stance phases, with the soles that stand and their steps."""
 
 from __future__ import annotations
 
@@ -11,15 +11,57 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.arrays import Array
-from impactopt.errors import InputError, check_array, shortened
+from impactopt.errors import InputError, check_array, check_number, raw_array, shortened
 from impactopt.kinematics.coordinates import LegClosure, StanceCoordinates
 from impactopt.kinematics.stance import BothSoles, OneSole, Stance, corners_at, overlap
 from impactopt.problem.checks import check_parts
-from impactopt.problem.scenario import Phase
 from impactopt.robots.robot import Robot
 
 _DESCENTS = np.arange(0.0, 0.21, 0.02)  # [m] of the base that are tried, in turn, for legs that do not reach
 _MAX_STEP = 2.0  # [m]: a longer step is a mistake of units
+
+
+# [s] of a phase: no servo is faster; an impact's motion takes about a second, and more is milliseconds
+SHORTEST, LONGEST = 1e-3, 60.0
+# intervals of a phase: with the middles of the intervals, a swing of 1 s has nodes at 4 kHz, as a fast servo
+FINEST = 2000
+STEEPEST = 1e3  # grading
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """Phase of the motion: duration and spline.
+
+    ``duration`` [s] : (shortest, longest), or one number.  ``intervals`` : number of the spline's intervals.
+    ``grading`` : longest interval over the shortest one; the short ones are at the contact. The program's
+    nodes are the ends and the middles of the intervals.
+    """
+
+    duration: tuple[float, float]
+    intervals: int = 12
+    grading: float = 3.0
+
+    def __post_init__(self) -> None:
+        one = raw_array("a phase's duration [s]", self.duration).ndim == 0
+        given: Any = (self.duration,) * 2 if one else self.duration
+        duration = check_array("a phase's duration [s]", given, (None,)).tolist()
+        if len(duration) != 2 or not SHORTEST <= duration[0] <= duration[1] <= LONGEST:
+            doubt = "; is it in milliseconds?" if max(duration, default=0.0) > LONGEST else ""
+            raise InputError(
+                f"a phase's duration [s] is a number of {SHORTEST:g} to {LONGEST:g} or (shortest, longest), "
+                f"not {shortened(str(self.duration))}{doubt}"
+            )
+        object.__setattr__(self, "duration", tuple(duration))
+        object.__setattr__(self, "grading", check_number("a phase's grading", self.grading))
+        if not 1 <= self.grading <= STEEPEST:
+            raise InputError(f"a phase's grading must be 1 to {STEEPEST:g}, not {self.grading:g}")
+        intervals = check_number("a phase's intervals", self.intervals)
+        if not 6 <= intervals <= FINEST or intervals != round(intervals):
+            raise InputError(
+                f"a phase needs 6 to {FINEST} spline intervals, a whole number, not "
+                f"{shortened(str(self.intervals))}"
+            )
+        object.__setattr__(self, "intervals", round(intervals))
 
 
 @dataclass(frozen=True, kw_only=True)

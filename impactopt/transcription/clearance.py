@@ -3,6 +3,11 @@
 `impactopt.bodies.separation` has the distance as a function of the joints between the two bodies: a kinematic
 chain of rotations about z axes, or translations along them. The fixed placements between the joints are
 parameters. This module finds the chains, and adds blocks and constraints to a program.
+
+The constraints depend on the displacement of the expected target from its place at contact: the harder the
+blow, the farther the target is from the follow-through. Displacements are variables: each is base + T v, with
+another displacement as its base, and a mean velocity v over a time T. The first ones are at the ends of the
+contact's phases. After contact a free target keeps its last velocity.
 """
 
 from __future__ import annotations
@@ -27,9 +32,15 @@ from impactopt.problem.violation import Place, millimetres
 from impactopt.robots.model import Axis, axis_of
 from impactopt.robots.robot import Robot
 from impactopt.transcription.builder import Block, Builder
-from impactopt.transcription.layout import Affine, ConstraintOrigin, stack
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.frozen_collision import InstantImpact
+from impactopt.transcription.layout import Affine, ConstraintOrigin, Group, stack
 
 TOO_NEAR = millimetres("too near")
+DISPLACEMENT = "displacement of the target"
+# [m] Unit of displacements as variables. An error of an early step, of a metre, must not outweigh all other
+# constraints.
+_DISPLACEMENT_UNIT = 10.0
 
 
 @dataclass(frozen=True)
@@ -369,3 +380,97 @@ def move_bodies(
         instance[name] += 1
     for name, block in of_name.items():
         block.take_parameters(parameters[name])
+
+
+@dataclass(frozen=True)
+class _Sum:
+    """Variables that equal base + T v.  step : of their elimination, as of `Builder.lifted`."""
+
+    group: Group
+    place: Place
+    base: Affine
+    T: Affine
+    v: Affine
+    step: int
+
+    def slots(self) -> list[list[Affine]]:
+        """Slots of the block ``link``, whose equation of position is base + T v for yf = 0."""
+        zero, one, each = Affine.zeros(1), Affine.constant(1.0), range(self.group.size)
+        parts = [(self.base[k : k + 1], self.v[k : k + 1]) for k in each]
+        return [
+            [zero, zero, one, -y, zero, one, self.T, zero, -v * (1 / _DISPLACEMENT_UNIT), zero, zero, zero]
+            for y, v in parts
+        ]
+
+
+class TargetDisplacement:
+    """Displacements (3,) [m] of the target in the world; zero if no body that is kept clear moves with it.
+
+    The variables are along the normal and, if friction moves the target, across it.
+    """
+
+    def __init__(self, b: Builder, hit: Collision | InstantImpact) -> None:
+        p = b.problem
+        self._b, self._hit, self._sums = b, hit, list[_Sum]()
+        moving = [body for body in p.bodies.world if body.moves] if p.keep_out.enabled else []
+        self._moves = bool(moving)
+        # a board is not there any more once contact begins
+        self._moves_on = not all(body.before for body in moving)
+        across = isinstance(hit, Collision) and hit.tangential.size > 0
+        self._labels = ["along the normal", *(f"across it, {axis}" for axis in "xyz" * across)]
+        self._axes: Array = _DISPLACEMENT_UNIT * np.column_stack([p.normal, np.eye(3)[:, : 3 * across]])
+        self._ends: list[Affine] = []  # components at the ends of the contact's phases
+
+    def before(self, remaining: Affine) -> Affine:
+        """Displacement at this time [s] before contact."""
+        speed = float(self._b.problem.target.speed_before()) if self._moves else 0.0
+        return remaining.apply(-speed / _DISPLACEMENT_UNIT * self._axes[:, :1])
+
+    def in_contact(self, stage: int, place: Place) -> Affine:
+        """Displacement at a collocation point."""
+        if not self._moves_on or not isinstance(self._hit, Collision):
+            return Affine.zeros(3)
+        base = self._end(self._hit.stages[stage].phase)
+        return self._add(place, base, *self._hit.target_moved(stage)).apply(self._axes)
+
+    def after(self, since: Affine | None, place: Place) -> Affine:
+        """Displacement at this time [s] after contact; None: at its end."""
+        if not self._moves_on:
+            return Affine.zeros(3)
+        base = self._end(len(self._hit.phases))
+        if since is not None and not self._b.problem.target.stays:
+            base = self._add(place, base, since, self._hit.target_velocity)
+        return base.apply(self._axes)
+
+    def add_constraints(self) -> None:
+        """Add the constraints of all variables so far."""
+        b = self._b
+        instances = [slots for each in self._sums for slots in each.slots()]
+        if not instances:
+            return
+        outputs = b.add_block("link", instances, np.zeros(0)) + 3 * np.arange(len(instances))
+        outputs = outputs.reshape(len(self._sums), -1) + b.parts("link")["position"]
+        for each, at in zip(self._sums, outputs, strict=True):
+            far = millimetres("off", scale=_DISPLACEMENT_UNIT)
+            b.equal(DISPLACEMENT, each.place, each.group.labels, at, far, affine=-each.group[0])
+            b.lifted.append((each.group, at, each.step))
+
+    def _end(self, phases: int) -> Affine:
+        """Components after so many phases of the contact."""
+        if not phases:
+            return Affine.zeros(len(self._labels))
+        while len(self._ends) < phases:
+            assert isinstance(self._hit, Collision)
+            k = len(self._ends)
+            place = Place.plain(f"end of {self._hit.phases[k].name}")
+            # other displacements begin at these, which are eliminated after them
+            step = len(self._hit.phases) - k
+            self._ends.append(self._add(place, self._end(k), *self._hit.target_moved(self._hit.end[k]), step))
+        return self._ends[phases - 1]
+
+    def _add(self, place: Place, base: Affine, T: Affine, v: Affine, step: int = 0) -> Affine:
+        """Components base + T v, as variables."""
+        name = f"{DISPLACEMENT}, {place.name}"
+        group = self._b.layout.add(name, 1, base.size, labels=self._labels)
+        self._sums.append(_Sum(group, place, base, T, v, step))
+        return group[0]

@@ -23,6 +23,7 @@ from impactopt.transcription.builder import Block, Builder
 from impactopt.transcription.clearance import (
     ClearanceKey,
     SeparatingDirection,
+    TargetDisplacement,
     add_clearance_constraints,
     coupled,
     move_bodies,
@@ -36,7 +37,6 @@ from impactopt.transcription.layout import Affine, Constraints, Group, Layout, T
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.springs import SpringPoint, add_hinges, add_springs
 from impactopt.transcription.structured import StructuredProgram
-from impactopt.transcription.target_displacement import TargetDisplacement
 
 Program = TypeVar("Program", bound="ContactProgram")
 

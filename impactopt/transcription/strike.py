@@ -16,6 +16,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.violation import Measure, Place
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
+from impactopt.transcription.clearance import TargetDisplacement
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_conditions import add_balance, add_conditions
 from impactopt.transcription.contact_program import BodyState, ContactProgram
@@ -26,7 +27,6 @@ from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.motion_phase import add_nodes, at_node
 from impactopt.transcription.objective import Prices, wrench_prices
 from impactopt.transcription.plan import PlannedStrike, total_ground_wrench
-from impactopt.transcription.target_displacement import TargetDisplacement
 
 
 class StrikeTranscription(ContactProgram):

@@ -29,7 +29,7 @@ from impactopt.problem.violation import Place, degrees, percent
 from impactopt.solvers.program import Determined
 from impactopt.transcription.blocks import ExtraBlock, extra_blocks, own_blocks, stance_blocks
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.clearance import SeparationBlock
+from impactopt.transcription.clearance import SeparationBlock, TargetDisplacement
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import typical_state
 from impactopt.transcription.contact_conditions import add_balance, add_clearance, add_conditions
@@ -51,7 +51,6 @@ from impactopt.transcription.springs import (
 )
 from impactopt.transcription.stance_change import PhaseSequence
 from impactopt.transcription.structured import derivative_functions
-from impactopt.transcription.target_displacement import TargetDisplacement
 
 USER_PREFIX = "user_"  # of users' blocks in C, which has functions of its own, such as floor
 SECOND_BLOCKS = ("second_contact", "second_approach")

@@ -25,8 +25,8 @@ from impactopt.planning.clearance_constraints import node_placements
 from impactopt.planning.solution import program_of
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.solvers.program import Status
+from impactopt.transcription.clearance import DISPLACEMENT
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.target_displacement import TERM
 
 OFF = (KeepOut(enabled=False), SelfCollision(enabled=False))
 TARGETS: dict[str, dict[str, Any]] = {
@@ -86,5 +86,5 @@ def test_where_no_body_moves_with_the_target_after_contact_there_are_no_such_var
     changes: dict[str, Any],
 ) -> None:
     t = transcribed(dataclasses.replace(arm_problem(), **changes))
-    assert not [name for name in t.layout.groups if name.startswith(TERM)]
+    assert not [name for name in t.layout.groups if name.startswith(DISPLACEMENT)]
     assert not node_placements(t, first_iterate(t)).at.displacement.any()

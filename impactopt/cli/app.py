@@ -14,12 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from impactopt.cli.collide import collide
-from impactopt.cli.compare import compare
-from impactopt.cli.drive import drive
-from impactopt.cli.export import export
-from impactopt.cli.files import check, new, problems, robots
-from impactopt.cli.identify import identify
-from impactopt.cli.options import (
+from impactopt.cli.command import (
     NO,
     AsJson,
     PlainCommand,
@@ -35,13 +30,19 @@ from impactopt.cli.options import (
     Workers,
     command_line,
     out_option,
+    plain_errors,
+    print_json,
 )
+from impactopt.cli.compare import compare
+from impactopt.cli.drive import drive
+from impactopt.cli.export import export
+from impactopt.cli.files import check, new, problems, robots
+from impactopt.cli.identify import identify
 from impactopt.cli.show import show
 from impactopt.cli.strike import strike
 from impactopt.cli.sweep import sweep
 from impactopt.cli.validate import validate
 from impactopt.cli.verify import verify
-from impactopt.report.plain_errors import plain_errors, print_json
 
 if TYPE_CHECKING:
     from impactopt.files.record import Record

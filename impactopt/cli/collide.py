@@ -9,8 +9,16 @@ from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import NO, AsJson, Quiet, Settings, Verbose, complete_problem
-from impactopt.report.plain_errors import plain_errors, print_json
+from impactopt.cli.command import (
+    NO,
+    AsJson,
+    Quiet,
+    Settings,
+    Verbose,
+    complete_problem,
+    plain_errors,
+    print_json,
+)
 
 RESULT_FREEZES = 16  # default for a saved result, as the contacts of plans are long
 Model = Literal["sdc", "sdc-paper", "virtual-mass", "rigid", "full"]

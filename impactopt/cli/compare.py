@@ -10,8 +10,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, out_option
-from impactopt.report.plain_errors import plain_errors, print_json
+from impactopt.cli.command import AsJson, out_option, plain_errors, print_json
 
 FILES = ("compare.json", "compare.png", "compare.html")
 

@@ -7,8 +7,17 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import NO, AsJson, ProblemPath, Quiet, Settings, Verbose, out_option
-from impactopt.report.plain_errors import plain_errors, print_json
+from impactopt.cli.command import (
+    NO,
+    AsJson,
+    ProblemPath,
+    Quiet,
+    Settings,
+    Verbose,
+    out_option,
+    plain_errors,
+    print_json,
+)
 
 
 def drive(

@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem, ResultPath, out_option
-from impactopt.report.plain_errors import plain_errors, print_json
+from impactopt.cli.command import AsJson, OtherProblem, ResultPath, out_option, plain_errors, print_json
 
 # commands that use the files, printed after writing them
 NEXT = {

@@ -8,8 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from impactopt.cli.options import ProblemPath, Quiet, Settings, Verbose, complete_problem, out_option
-from impactopt.report.plain_errors import BAD_INPUT, plain_errors, print_json
+from impactopt.cli.command import (
+    BAD_INPUT,
+    ProblemPath,
+    Quiet,
+    Settings,
+    Verbose,
+    complete_problem,
+    out_option,
+    plain_errors,
+    print_json,
+)
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem

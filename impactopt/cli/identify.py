@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, Verbose, complete_problem, out_option
-from impactopt.report.plain_errors import plain_errors, print_json
+from impactopt.cli.command import AsJson, Verbose, complete_problem, out_option, plain_errors, print_json
 
 
 def identify(

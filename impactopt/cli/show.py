@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impactopt.cli.options import OtherProblem, out_option
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.command import OtherProblem, out_option, plain_errors
 
 if TYPE_CHECKING:
     from impactopt.files.replay import Planned

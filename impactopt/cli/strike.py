@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import (
+from impactopt.cli.command import (
     NO,
     AsJson,
     ProblemPath,
@@ -21,8 +21,9 @@ from impactopt.cli.options import (
     Workers,
     command_line,
     out_option,
+    plain_errors,
+    print_json,
 )
-from impactopt.report.plain_errors import plain_errors, print_json
 
 
 def strike(

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.cli.options import NO, AsJson, Quiet, complete_sweep, out_option
-from impactopt.report.plain_errors import plain_errors, print_json
+from impactopt.cli.command import NO, AsJson, Quiet, complete_sweep, out_option, plain_errors, print_json
 
 if TYPE_CHECKING:
     from impactopt.sweeps import SweepResult

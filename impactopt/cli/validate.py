@@ -9,8 +9,18 @@ from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import NO, AsJson, OtherProblem, Quiet, ResultPath, Settings, Verbose, out_option
-from impactopt.report.plain_errors import plain_errors, print_json
+from impactopt.cli.command import (
+    NO,
+    AsJson,
+    OtherProblem,
+    Quiet,
+    ResultPath,
+    Settings,
+    Verbose,
+    out_option,
+    plain_errors,
+    print_json,
+)
 
 
 def validate(

@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import typer
 
-from impactopt.cli.options import NO, AsJson, OtherProblem, Quiet, ResultPath, Verbose
-from impactopt.report.plain_errors import plain_errors, print_json
+from impactopt.cli.command import (
+    NO,
+    AsJson,
+    OtherProblem,
+    Quiet,
+    ResultPath,
+    Verbose,
+    plain_errors,
+    print_json,
+)
 
 
 def verify(

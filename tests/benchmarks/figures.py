@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from benchmarks.report import Say
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.command import plain_errors
 
 if TYPE_CHECKING:
     from impactopt.report.pictures.style import Picture

@@ -9,7 +9,7 @@ from pathlib import Path
 import typer
 
 from benchmarks.report import Report, Say
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.command import plain_errors
 
 
 def show_reports(

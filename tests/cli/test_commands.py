@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 import impactopt
 from impactopt import FullDynamics, InputError, Robot, load_problem, load_robot, problem_names
 from impactopt.cli.app import app
-from impactopt.cli.options import Quiet, Settings, command_line, complete_problem
+from impactopt.cli.command import Quiet, Settings, command_line, complete_problem
 from impactopt.collide.single_collision import collide_once
 from impactopt.files.named_problems import problem_file
 from impactopt.files.output import save_record
@@ -332,7 +332,7 @@ def test_help_and_completion_load_nothing_heavy() -> None:
         "import sys\n"
         "from typer.testing import CliRunner\n"
         "from impactopt.cli.app import app\n"
-        "from impactopt.cli.options import complete_problem, complete_sweep\n"
+        "from impactopt.cli.command import complete_problem, complete_sweep\n"
         "assert 'punch' in complete_problem('pun')\n"
         "assert complete_sweep('collision_t') == ['collision_target']\n"
         "for arguments in (['--help'], ['solve', '--help'], ['collide', '-h'], []):\n"
@@ -478,7 +478,7 @@ def test_keys_that_are_offered_come_from_the_cache(tmp_path: Path, monkeypatch: 
     code = (
         "import sys\n"
         "from types import SimpleNamespace\n"
-        "from impactopt.cli.options import complete_setting\n"
+        "from impactopt.cli.command import complete_setting\n"
         "print(complete_setting(SimpleNamespace(params={'file': 'punch'}, args=[]), 'target.m'))\n"
         "print([m for m in ('pydantic', 'scipy', 'casadi', 'pinocchio') if m in sys.modules])"
     )

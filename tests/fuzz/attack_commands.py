@@ -19,7 +19,7 @@ import numpy as np
 
 from fuzz.attack_cases import Found, Generator, attempt, odd_number, pick
 from fuzz.attack_files import mutated_file, spoil_bytes, texts
-from impactopt.report.plain_errors import BUG
+from impactopt.cli.command import BUG
 
 RESULT = "result"
 _PROBLEM = "arm_planar"

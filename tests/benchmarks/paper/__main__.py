@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.running import show_reports
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.command import plain_errors
 
 app = typer.Typer(name="reproduce")
 

@@ -1,21 +1,29 @@
-"""Options that several commands share."""
+"""Base of all commands: options that several share, their class, plain messages on errors, and JSON."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import re
 import shlex
+import signal
+import threading
+import traceback
 import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from impactopt.errors import did_you_mean
+from impactopt.errors import InputError, did_you_mean, printable
 
-NO = 1  # exit code of a command whose answer is no
+if TYPE_CHECKING:
+    from rich.console import Console
+
+NO, BAD_INPUT, BUG, INTERRUPTED = 1, 2, 70, 130  # exit codes; 1: the answer is no
 
 
 def complete_problem(incomplete: str) -> list[str]:
@@ -190,3 +198,63 @@ def command_line(context: typer.Context) -> str:
         for each in value if isinstance(value, (list, tuple)) else [value]:
             words += [option, str(each)] if option.startswith("-") else [str(each)]
     return shlex.join(words)
+
+
+def print_json(summary: Mapping[str, Any], ok: bool) -> None:
+    """Prints the result of a command as JSON; its first key is `ok` for every command: exit code 0."""
+    fields = {key: value for key, value in summary.items() if key != "ok"}
+    typer.echo(json.dumps({"ok": ok} | fields, indent=2))
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Makes SIGTERM raise KeyboardInterrupt, in the main thread, unless it has another handler."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def plain_errors(
+    interrupted: str, *, verbose: bool = False, keeps: bool = False, as_json: bool = False
+) -> Iterator[Console]:
+    """Context of a command's body, with a console on stderr.
+
+    interrupted : printed on a Ctrl-C that the body does not catch.
+    verbose : bad input prints a traceback.
+    as_json : bad input is printed on stdout, too, as {"ok": false, "error"}.
+    keeps : the body saves its results on Ctrl-C; then SIGTERM, as of a scheduler, has the same effect.
+    """
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    on_sigterm = _terminated_as_interrupted() if keeps else contextlib.nullcontext()
+    with warnings.catch_warnings(), on_sigterm:
+        warnings.showwarning = lambda message, *_a, **_k: console.print(
+            printable(f"warning: {message}"), markup=False
+        )
+        try:
+            yield console
+        except InputError as error:
+            if verbose:
+                traceback.print_exc()
+            typer.echo(printable(f"error: {error}"), err=True)
+            if as_json:
+                print_json({"error": str(error)}, False)
+            raise typer.Exit(BAD_INPUT) from None
+        except KeyboardInterrupt:
+            typer.echo(interrupted, err=True)
+            raise typer.Exit(INTERRUPTED) from None
+        except (typer.Exit, typer.Abort, typer.BadParameter, BrokenPipeError):
+            raise
+        except Exception:
+            # exit code 1 is a command's "no", on which a script may rely
+            traceback.print_exc()
+            typer.echo("error: this is a fault of impactopt; please report it with the lines above", err=True)
+            raise typer.Exit(BUG) from None

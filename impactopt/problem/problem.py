@@ -317,7 +317,9 @@ class ImpactProblem:
     @property
     def frozen(self) -> Effects | None:
         """Effects of a collision model with frozen dynamics; None for other models."""
-        return {"sdc": Effects(), "sdc-paper": Effects.paper()}.get(self.collision)
+        if self.collision == "sdc":
+            return Effects()
+        return Effects.paper() if self.collision == "sdc-paper" else None
 
     @property
     def scene(self) -> dict[str, Any]:

@@ -175,15 +175,12 @@ _IN_EACH_LANE = {
     ca.OP_OR: "x || y",
     ca.OP_IF_ELSE_ZERO: "x ? y : 0",
 }
-
-
-def _formula(kind: int) -> str:
-    """C expression of an operation on the vectors a, b and c."""
-    return _OF_VECTORS.get(kind) or f"op_{kind}(a, {'b' if 'y' in _IN_EACH_LANE[kind] else 'a'})"
-
-
+# those of all operations, on vectors
+_FORMULAS = _OF_VECTORS | {
+    kind: f"op_{kind}(a, {'b' if 'y' in formula else 'a'})" for kind, formula in _IN_EACH_LANE.items()
+}
 # number of operands of each kind, counted in its expression
-_OPERANDS = {k: len({*re.findall(r"\b[abc]\b", _formula(k))}) for k in (*_OF_VECTORS, *_IN_EACH_LANE)}
+_OPERANDS = {kind: len({*re.findall(r"\b[abc]\b", formula)}) for kind, formula in _FORMULAS.items()}
 
 _VECTORS = """#define LANES %d
 #include <math.h>
@@ -268,7 +265,7 @@ def in_lanes(functions: Sequence[ca.Function], lanes: int = LANES) -> list[Nativ
 def _loops(lanes: int, place: str) -> SharedCode:
     """C code of the loops over operations of each kind, which all functions share."""
     each = [f"IN_EACH_LANE(op_{kind}, {formula})" for kind, formula in _IN_EACH_LANE.items()]
-    runs = (f"RUN({kind}, {operands}, {_formula(kind)})" for kind, operands in _OPERANDS.items())
+    runs = (f"RUN({kind}, {_OPERANDS[kind]}, {formula})" for kind, formula in _FORMULAS.items())
     loops = _LOOPS % "\n      ".join(runs)
     code = "\n".join([_VECTORS % (lanes, place), _HEAD, *each, loops])
     return SharedCode(name="lanes", code=code, level=_LEVEL)

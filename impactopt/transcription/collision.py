@@ -25,7 +25,7 @@ from impactopt.problem.violation import Measure, Place, millimetres, percent
 from impactopt.robots.model import mass_matrix
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.contact_blocks import DEPTH_SCALE, FORCE_SCALE, typical_state
+from impactopt.transcription.contact_blocks import DEPTH_SCALE, FORCE_SCALE
 from impactopt.transcription.contact_guess import coasted, effective_mass, guessed_contact
 from impactopt.transcription.contact_state import (
     Contact,
@@ -262,7 +262,7 @@ class Collision(ContactParameters):
         self.f = add(
             "contact force", len(p.strikers), scale=FORCE_SCALE, lower=least, upper=most, measure=newtons
         )
-        self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
+        self.state = add("target state", p.target.n_states, scale=p.target.typical_state)
         self.xt = add("target travel", 1, labels=["target"])
         bent = 3 * len(p.strikers) if len(friction_parameters(p)) > 2 else 0
         # in a gap the bristles are not bent, by their bounds, so that each touch begins with unbent ones

@@ -288,7 +288,7 @@ def force(
     residual, rate, depth, separation = of_hands[0]
     out = {
         "law": residual,
-        "target": (slope - T * derivative) / np.array(typical_state(target)),
+        "target": (slope - T * derivative) / np.array(target.typical_state),
         "travel": rate_x - speed,
         "impulse": rate_p - T * total,
         "rate": rate,
@@ -337,11 +337,6 @@ def carried(c: StanceCoordinates) -> BlockExpression:
     force -= c.sole_wrench_map(y, legs, w)
     out = {"base": force[: c.base, :] / base_scale(c, weight, lever)}
     return make_block([y, legs, u, w], [weight, lever], out, lanes=1)
-
-
-def typical_state(target: Target) -> tuple[float, ...]:
-    """Typical sizes of the components of a target's state."""
-    return target.typical or (1.0,) * target.n_states
 
 
 def impact(c: StanceCoordinates, striker: str) -> BlockExpression:

@@ -31,7 +31,6 @@ from impactopt.transcription.blocks import ExtraBlock, extra_blocks, own_blocks,
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.clearance import SeparationBlock, TargetDisplacement
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.contact_blocks import typical_state
 from impactopt.transcription.contact_conditions import add_balance, add_clearance, add_conditions
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import ContactSet
@@ -71,7 +70,7 @@ def block_functions(
     recipe = (*_coordinates_recipe(coordinates), problem.striker, edges)
     target = problem.target
     frozen = () if problem.frozen is None else (problem.frozen,)
-    contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen)
+    contact = (problem.law.formula(), target.formula(), target.typical_state, *frozen)
     springs = tuple(np.flatnonzero(robot.sprung).tolist())
     second = () if problem.second is None else (problem.second.striker,)
     rubs = () if problem.friction is None else ("rubs", len(problem.friction.parameters))

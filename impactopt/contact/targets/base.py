@@ -113,6 +113,11 @@ class Target(Described, ABC):
         return len(self.guards) < len(self.phases) - 1
 
     @property
+    def typical_state(self) -> tuple[float, ...]:
+        """``typical``, or ones if it is not given."""
+        return self.typical or (1.0,) * self.n_states
+
+    @property
     def parameters(self) -> dict[str, float]:
         """Parameters of the target by name; a collision model takes each as an input named `target_<name>`.
 

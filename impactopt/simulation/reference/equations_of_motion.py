@@ -129,7 +129,7 @@ def contact_scales(body: Body, forces: Forces, rate: float, horizon: float) -> S
     # change of the target's states by the larger of their rates at rest and after this time
     first = np.array(forces.target_rates(at_rest, impulse / time), dtype=float)
     second = np.array(forces.target_rates(first * time, impulse / time), dtype=float)
-    typical = np.array(forces.target.typical or np.ones(at_rest.size))
+    typical = np.array(forces.target.typical_state)
     target = np.maximum(np.abs(first), np.abs(second)) * time
     return Scales(time, closing, impulse, np.maximum(target, 1e-6 * typical), inverse_mass)
 

@@ -327,10 +327,11 @@ def test_a_ball_that_comes_is_not_yet_at_its_place_in_the_record() -> None:
     t = transcribed(dataclasses.replace(arm_problem(), target=FreeMass(mass=0.5, initial_velocity=-3.0)))
     problem, x = t.problem, first_iterate(t)
     program, v = second(t, x)
-    trajectory, rng = t.decode(x).trajectory(), np.random.default_rng(0)
+    trajectory, rng = t.decode(x).trajectory(step=5e-3), np.random.default_rng(0)
     depth = 0.0
     while not depth > 0.01:  # in the ball, and in nothing else
-        q = pin.integrate(problem.robot.model, problem.start_posture, rng.uniform(-1.0, 1.0, problem.robot.n))
+        turn = rng.uniform(-0.5, 0.5, problem.robot.n)
+        q = pin.integrate(problem.robot.model, problem.contact_posture, turn)
         touches = problem.bodies.survey(
             np.zeros(1), Places.of(problem.robot, q[None], np.zeros(1, dtype=np.intp))
         ).touches

@@ -85,6 +85,8 @@ class ContactProgram(ABC):
         self.objectives: list[tuple[Objective, Quantity]] = []
         self.clearance_constraints: Mapping[ClearanceKey, SeparatingDirection] = {}
         self.postures: dict[int, Array] = {}
+        # without clearance constraints, but with all their couplings; made with the first ones
+        self._base: StructuredProgram | None = None
 
     # ------------------------------------------------------------------ for terms and objectives
     @property
@@ -248,7 +250,7 @@ class ContactProgram(ABC):
         self._objective = assemble(self.layout, self.objectives, self._prices())
         # each round's set of clearance constraints is added to a copy of this builder
         self._without_clearance = self.builder
-        self.program = self._assembled()
+        self.program = self._assembled(self._objective[1])
 
     def _check_own(self, kind: str, since: int, before: int) -> None:
         """InputError unless a user's own term has added constraints, with all outputs of the blocks it added.
@@ -270,11 +272,9 @@ class ContactProgram(ABC):
                 "instance's outputs follow those of the instance before"
             )
 
-    def _assembled(self) -> StructuredProgram:
-        objective, quadratic, linear = self._objective
-        # one structure for all sets of clearance constraints, which solvers can reuse
-        if self.clearance_constraints:
-            quadratic = coupled(quadratic, self.body_spots, self.displacements)
+    def _assembled(self, quadratic: Any, base: StructuredProgram | None = None) -> StructuredProgram:
+        """Program of the builder.  quadratic, base: as of `StructuredProgram`."""
+        objective, _, linear = self._objective
         return StructuredProgram(
             self.layout,
             self.blocks,
@@ -288,6 +288,7 @@ class ContactProgram(ABC):
                     *self._determined(),
                 ]
             ),
+            base=base,
         )
 
     def with_clearance(self: Program, constraints: Mapping[ClearanceKey, SeparatingDirection]) -> Program:
@@ -299,7 +300,16 @@ class ContactProgram(ABC):
         other.builder = self._without_clearance.copy()
         order = add_clearance_constraints(other.builder, self.body_spots, self.displacements, constraints)
         other.clearance_constraints = {key: constraints[key] for key in order}
-        other.program = other._assembled()
+        if not order:
+            other.program = other._assembled(self._objective[1])
+            return other
+        if self._base is None:
+            # one structure for all sets of clearance constraints, which solvers can reuse
+            quadratic = coupled(self._objective[1], self.body_spots, self.displacements)
+            bare = copy.copy(self)
+            bare.builder = self._without_clearance
+            self._base = other._base = bare._assembled(quadratic)
+        other.program = other._assembled(self._base.quadratic, self._base)
         return other
 
     @cached_property

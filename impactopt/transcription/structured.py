@@ -20,7 +20,7 @@ import ctypes
 import functools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -124,6 +124,18 @@ class Runs:
         runs = source.astype(np.int32), destination.astype(np.int32), length.astype(np.int32)
         return cls(*runs, factor, shape)
 
+    def with_more(
+        self, source: Index, destination: Index, length: Index, factor: Array, entries: int
+    ) -> Runs:
+        """These runs and more, of so many ``entries`` in all."""
+        return Runs.make(
+            np.append(self.source, source),
+            np.append(self.destination, destination),
+            np.append(self.length, length),
+            np.append(self.factor, factor),
+            (self.shape[0], entries),
+        )
+
     def add_to(self, out: Array, entries: Array) -> None:
         """Add the scattered entries to ``out``."""
         library = _library()
@@ -217,19 +229,61 @@ class JacobianMap:
         return _with_values(self._template, values)
 
 
+@dataclass(frozen=True, eq=False)
 class HessianMap:
     """Scatter-add of the blocks' Hessians to that of sigma x'Qx/2 + multipliers . out, which is (n, n).
 
     The lower triangle L of a block contributes S'(L + L' - diag L)S. So S'(L - diag L / 2)S is added up,
     together with Q/2, and the Hessian is that matrix plus its transpose.
+
+    blocks : their number.  template : matrix with the Hessian's pattern.
+    pattern : linear indices of its nonzeros, sorted.  across : number of each nonzero's mirrored one.
+    half : Q/2 in that pattern.  sums : scatter-add of the nonzeros of all blocks' Hessians.
     """
 
-    def __init__(self, blocks: Sequence[Block], lift: sp.csr_array, quadratic: sp.csc_array):
+    blocks: int
+    template: sp.csc_array
+    pattern: Index
+    across: Int32
+    half: Array
+    sums: Runs
+
+    @classmethod
+    def of(cls, blocks: Sequence[Block], lift: sp.csr_array, quadratic: sp.csc_array) -> HessianMap:
         """lift : S, of the inputs of all blocks.  quadratic : Q (n, n)."""
-        self._entries, starts = _shared([b.hessian for b in blocks])
-        self._shape = n, _ = quadratic.shape
-        parts, z, continues = [], 0, _continues(lift)
-        for b, start in zip(blocks, starts, strict=False):
+        shape = n, _ = quadratic.shape
+        source, linear_index, length, factor = cls._terms(blocks, lift)
+        at, values = _linear_indices(quadratic)
+        half, other = (_pattern(p, shape) for p in (union(linear_index, length), union(at)))
+        template = sp.csc_array(half + half.T + other)
+        pattern = np.repeat(np.arange(n), np.diff(template.indptr)) * n + template.indices
+        # transposing a matrix that holds the nonzeros' own numbers gives the number of each mirrored one
+        numbers = sp.csc_array((np.arange(pattern.size), template.indices, template.indptr), shape)
+        across = numbers.T.tocsc().data.astype(np.int32)
+        in_pattern = np.bincount(np.searchsorted(pattern, at), 0.5 * values, pattern.size).astype(float)
+        sizes = pattern.size, int(_starts(blocks)[-1])
+        sums = Runs.make(source, np.searchsorted(pattern, linear_index), length, factor, sizes)
+        return cls(len(blocks), template, pattern, across, in_pattern, sums)
+
+    def extended(self, blocks: Sequence[Block], lift: sp.csr_array) -> HessianMap | None:
+        """Map of these blocks and more; None if the pattern lacks one of their entries."""
+        source, linear_index, length, factor = self._terms(blocks, lift, self.blocks)
+        begin = np.searchsorted(self.pattern, linear_index)
+        end = (begin + length - 1).clip(max=self.pattern.size - 1)
+        # indices ascend, so those of a run are all there if its last one is where it has to be
+        if (self.pattern[end] != linear_index + length - 1).any():
+            return None
+        sums = self.sums.with_more(source, begin, length, factor, int(_starts(blocks)[-1]))
+        return replace(self, blocks=len(blocks), sums=sums)
+
+    @staticmethod
+    def _terms(
+        blocks: Sequence[Block], lift: sp.csr_array, since: int = 0
+    ) -> tuple[Index, Index, Index, Array]:
+        """Sources, linear indices, lengths and factors of the runs of the blocks from number ``since`` on."""
+        parts, n, continues = [], lift.shape[1], _continues(lift)
+        z = sum(b.count * b.n_in for b in blocks[:since])
+        for b, start in zip(blocks[since:], _starts(blocks)[since:], strict=False):
             rows, columns = b.hess_pattern
             instance = np.arange(b.count)[:, None] * b.n_in
             # (instances, nonzeros of one): row and column among the inputs of all blocks
@@ -246,24 +300,19 @@ class HessianMap:
             row_factor = row_factor * factor[of_term] * np.where(row == column, 0.5, 1.0)[owner]
             parts.append((start + first[owner], c[of_term] * n + r, length[owner], row_factor))
             z += b.count * b.n_in
-        source, linear_index, length, factor = _concatenated(parts)
-        at, values = _linear_indices(quadratic)
-        half, other = (_pattern(p, self._shape) for p in (union(linear_index, length), union(at)))
-        self._template = template = sp.csc_array(half + half.T + other)
-        pattern = np.repeat(np.arange(n), np.diff(template.indptr)) * n + template.indices
-        # transposing a matrix that holds the nonzeros' own numbers gives the number of each mirrored one
-        numbers = sp.csc_array((np.arange(pattern.size), template.indices, template.indptr), self._shape)
-        self._across = numbers.T.tocsc().data.astype(np.int32)
-        self._half = np.bincount(np.searchsorted(pattern, at), 0.5 * values, pattern.size)  # Q/2
-        shape = pattern.size, self._entries.size
-        self._sums = Runs.make(source, np.searchsorted(pattern, linear_index), length, factor, shape)
+        return _concatenated(parts)
 
-    def matrix(self, sigma: float) -> sp.csc_array:
-        """Hessian for the blocks' latest values."""
-        values: Array = np.multiply(sigma, self._half)
-        self._sums.add_to(values, self._entries)
-        values = with_transposed(values, self._across)
-        return _with_values(self._template, values)
+    def matrix(self, sigma: float, entries: Array) -> sp.csc_array:
+        """Hessian for nonzeros of all blocks' Hessians."""
+        values: Array = np.multiply(sigma, self.half)
+        self.sums.add_to(values, entries)
+        values = with_transposed(values, self.across)
+        return _with_values(self.template, values)
+
+
+def _starts(blocks: Sequence[Block]) -> Index:
+    """Offsets of the nonzeros of each block's Hessian among those of all blocks, and their number."""
+    return np.cumsum([0, *[b.hessian.size for b in blocks]])
 
 
 def _shared(functions: Sequence[BatchedFunction]) -> tuple[Array, Index]:
@@ -351,11 +400,15 @@ class StructuredProgram:
         quadratic: sp.spmatrix | sp.sparray,
         linear: Array,
         determined: Sequence[Determined] = (),
+        base: StructuredProgram | None = None,
     ) -> None:
         """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to ``constraints`` and the layout's bounds.
 
         determined : variables that the solver can eliminate by equality constraints.
+        base : program of the first blocks alone, with the same variables and Q; its Hessian's structure is
+            taken over if it has a place for those of the other blocks.
         """
+        self._base = base
         self.determined = tuple(determined)
         self.layout, self.blocks, self.origins = layout, tuple(blocks), tuple(constraints.origins)
         n = self.n = layout.n
@@ -391,9 +444,9 @@ class StructuredProgram:
         self._c = np.zeros(n)
         np.add.at(self._c, objective.cols, objective.vals)
         self._c += linear
-        self._c0, self._Q = float(objective.const.sum()), sp.csc_array(quadratic)
+        self._c0, self.quadratic = float(objective.const.sum()), sp.csc_array(quadratic)
         # Q has explicit zeros, which reserve the pattern for couplings by clearance; products skip them
-        self._curvature = self._Q.copy()
+        self._curvature = self.quadratic.copy()
         self._curvature.eliminate_zeros()
         self.seconds = 0.0  # spent on evaluations
 
@@ -424,7 +477,7 @@ class StructuredProgram:
         )
 
     def _parameters(self) -> list[Array]:
-        matrices = self._lift, self._affine_matrix, self._Q
+        matrices = self._lift, self._affine_matrix, self.quadratic
         return [
             *(self.x_lower, self.x_upper, self.g_lower, self.g_upper),
             *(self._lift_const, self._affine_const, self._c, np.array([self._c0])),
@@ -441,7 +494,14 @@ class StructuredProgram:
 
     @cached_property
     def _hessian(self) -> HessianMap:
-        return HessianMap(self.blocks, self._lift, self._Q)
+        base = self._base
+        return (base and base._hessian.extended(self.blocks, self._lift)) or HessianMap.of(
+            self.blocks, self._lift, self.quadratic
+        )
+
+    @cached_property
+    def _hessian_entries(self) -> Array:
+        return _shared([b.hessian for b in self.blocks])[0]
 
     def _lifted(self, x: Array) -> list[Array]:
         """Inputs z (count, n_in) of each block."""
@@ -488,13 +548,13 @@ class StructuredProgram:
 
     def hessian(self, x: Array, sigma: float, multipliers: Array) -> sp.csc_array:
         t = time.perf_counter()
-        found = self._hessian  # before the blocks are called: it sets the array that they write to
+        entries = self._hessian_entries  # before the blocks are called: it sets the array that they write to
         # outputs that are in no constraint keep zero, and contribute nothing
         lam = np.zeros(int(self._out_offset[-1]))  # multiplier of each output's constraint
         lam[self._of_nonlinear] = multipliers[self._nonlinear]
         for b, z, o in zip(self.blocks, self._lifted(x), self._out_offset, strict=False):
             b.hessian(z, lam[o : o + b.count * b.n_out].reshape(b.count, b.n_out))
-        out = found.matrix(sigma)
+        out = self._hessian.matrix(sigma, entries)
         self.seconds += time.perf_counter() - t
         return out
 

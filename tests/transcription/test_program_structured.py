@@ -91,6 +91,7 @@ class Pair:
         self.g = ca.vertcat(*wanted)
         goal, q = slot(2), rng.standard_normal((n, n))
         quadratic, slope = q @ q.T, rng.standard_normal(n)
+        self.rows, self.goal, self.slope = rows, goal, slope
         self.program = StructuredProgram(
             self.layout, self.blocks, rows, objective=goal, quadratic=sp.csr_array(quadratic), linear=slope
         )
@@ -125,6 +126,23 @@ def test_a_structured_program_is_the_monolithic_one(seed: int) -> None:
             hessian.toarray(), np.array(pair.hessian(x, sigma, y)), rtol=1e-9, atol=1e-10
         )
         np.testing.assert_allclose(hessian.toarray(), hessian.toarray().T, atol=1e-12)
+
+
+@pytest.mark.parametrize("coupled", [True, False], ids=["within its pattern", "beyond its pattern"])
+@given(seeds)
+@settings(max_examples=5, deadline=None)
+def test_the_hessian_of_a_program_grows_from_that_of_its_first_blocks(coupled: bool, seed: int) -> None:
+    pair, rng = Pair(seed), np.random.default_rng(seed + 2)
+    full = pair.program.quadratic.toarray()
+    own = full if coupled else np.diag(np.diag(full))
+    kind = {"quadratic": sp.csr_array(own), "linear": pair.slope}
+    base = StructuredProgram(pair.layout, pair.blocks[:1], Constraints(), objective=pair.goal, **kind)
+    program = StructuredProgram(pair.layout, pair.blocks, pair.rows, objective=pair.goal, base=base, **kind)
+    x, y, sigma = rng.standard_normal(program.n), rng.standard_normal(program.m), 1.5
+    wanted = np.array(pair.hessian(x, sigma, y)) + sigma * (own - full)
+    found = program.hessian(x, sigma, y)
+    np.testing.assert_allclose(found.toarray(), wanted, rtol=1e-9, atol=1e-10)
+    assert found.has_canonical_format
 
 
 def test_derivatives_agree_with_differences() -> None:

@@ -62,7 +62,9 @@ def fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> lis
     """
     row_left, column_left = np.ones(touches.shape[0], dtype=bool), np.ones(touches.shape[1], dtype=bool)
     # The masks are dense: n^2 bytes for couples, 11 MB for the demo's punch (n = 3347).
-    touched_by = np.ascontiguousarray(touches.T)  # a copy, as columns are read as often as rows
+    # Columns are read as often as rows. A dense transposition would take ten times as long.
+    touched_by = np.zeros(touches.shape[::-1], dtype=bool)
+    touched_by[nonzero_entries(touches)[::-1]] = True
     out = []
     for elimination in eliminations:
         waiting = list(zip(*elimination, strict=True))
@@ -155,38 +157,43 @@ def nonzero_entries(matrix: Any) -> tuple[Index, Index]:
     return np.divmod(np.flatnonzero(matrix), matrix.shape[1])
 
 
-def number_entries(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
-    """Places of the entries (i, j) of a matrix, from 1 on, 0 for all others; and the number of entries.
-
-    Place 0 of the values is a zero, so that entries outside the pattern need no special case.
-    """
-    out = np.zeros(shape, dtype=np.int32)
-    out[i, j] = np.arange(1, i.size + 1)
-    return out, i.size
-
-
 _lower = functools.cache(np.tril_indices)
 
 
-class HessianPlaces:
-    """Places, from 1 on, of the entries (i, j) of the lower triangle of W, the condensed Hessian.
+class EntryPlaces:
+    """Places of the entries (i, j) of a matrix with n columns, from 1 on, and 0 for all others.
 
-    Each look-up is a search in half a million entries. Programs that grow by a few constraints repeat the
-    same ones, so those of each row pattern are cached.
+    Place 0 of the values is a zero, so that entries outside the pattern need no special case. Each look-up is
+    a search among half a million entries: a table of all n^2 places would take longer to fill.
     """
 
     def __init__(self, i: Index, j: Index, n: int) -> None:
-        """i, j : ascending, row by row."""
+        """i, j (k,) : ascending, row by row."""
+        self.count = i.size
         self._n, self._keys = n, i * n + j
-        self._of_row: dict[bytes, Places] = {}
-        self._of_matrix: tuple[Index, Index, Places] | None = None
 
     def at(self, i: Index, j: Index) -> Places:
-        """Places (k,) of entries (k,); 0 for entries outside the pattern."""
+        """Places of entries; i, j : arrays of any shapes that NumPy broadcasts."""
         # In 64 bits, as n^2 exceeds 32 from 46 341 variables on.
         wanted = i.astype(np.int64) * self._n + j
         found = np.searchsorted(self._keys, wanted).clip(max=self._keys.size - 1)
         return np.where(self._keys[found] == wanted, found + 1, 0).astype(np.int32)
+
+
+class HessianPlaces(EntryPlaces):
+    """Places of the entries of the lower triangle of W, the condensed Hessian.
+
+    Programs that grow by a few constraints repeat the same look-ups, so those of each row pattern are cached.
+    """
+
+    def __init__(self, i: Index, j: Index, n: int) -> None:
+        super().__init__(i, j, n)
+        self._of_row: dict[bytes, Places] = {}
+        self._of_matrix: tuple[Index, Index, Places] | None = None
+
+    def symmetric(self, i: Index, j: Index) -> Places:
+        """Places of entries in either triangle, as of `at`."""
+        return self.at(np.maximum(i, j), np.minimum(i, j))
 
     def of_rows(self, columns: Index) -> Places:
         """Places (k, p (p + 1) / 2) of the outer products of rows with these columns (k, p)."""
@@ -217,24 +224,24 @@ def same_shapes(systems: list[Touched]) -> list[list[Touched]]:
     return list(out.values())
 
 
-def elimination_stage(systems: list[Touched], J_places: Places, W_places: Places) -> EliminationStage:
+def elimination_stage(systems: list[Touched], of_J: EntryPlaces, of_W: HessianPlaces) -> EliminationStage:
     """Elimination stage for systems of one shape.
 
-    J_places, W_places : of the entries of the equalities and of W, as of `number_entries`.
+    of_J, of_W : places of the entries of the equalities and of W.
     """
     # All of one shape: (k, r) of q and e, (k, nt), (k, nc) and (k, nu).
     q, e, t, c, u = (np.array([getattr(s, name) for s in systems]) for name in ("q", "e", "t", "c", "u"))
     i, j = _lower(c.shape[1])
     places = {
         # (k, column, row), which is LAPACK's storage by columns.
-        "qe": J_places[q[:, None, :], e[:, :, None]],
-        "qc": J_places[q[:, None, :], c[:, :, None]],
-        "te": J_places[t[:, :, None], e[:, None, :]],
-        "tc": J_places[t[:, :, None], c[:, None, :]],
-        "hee": W_places[e[:, :, None], e[:, None, :]],
-        "heu": W_places[u[:, :, None], e[:, None, :]],
-        "hcc": W_places[c[:, i], c[:, j]],
-        "hcv": W_places[c[:, :, None], u[:, None, c.shape[1] :]],
+        "qe": of_J.at(q[:, None, :], e[:, :, None]),
+        "qc": of_J.at(q[:, None, :], c[:, :, None]),
+        "te": of_J.at(t[:, :, None], e[:, None, :]),
+        "tc": of_J.at(t[:, :, None], c[:, None, :]),
+        "hee": of_W.symmetric(e[:, :, None], e[:, None, :]),
+        "heu": of_W.symmetric(u[:, :, None], e[:, None, :]),
+        "hcc": of_W.symmetric(c[:, i], c[:, j]),
+        "hcv": of_W.symmetric(c[:, :, None], u[:, None, c.shape[1] :]),
     }
     numbers = {"q": q, "e": e, "t": t, "u": u, **places}
     return EliminationStage(**{name: np.ascontiguousarray(a, dtype=np.int32) for name, a in numbers.items()})
@@ -353,27 +360,24 @@ class Condenser:
         systems = fill(touches, couples, [Elimination(number[q], e) for q, e in eliminations])
 
         # places of all entries, fill-in included
-        J_places, count = number_entries(*nonzero_entries(touches), touches.shape)
+        of_J = EntryPlaces(*nonzero_entries(touches), n)
         i, j = nonzero_entries(couples)
         i, j = i[i >= j], j[i >= j]
-        W_places, coupled = number_entries(i, j, couples.shape)
-        self._hessian_places = HessianPlaces(i, j, n)
-        self.J, self.W = np.zeros(count + 1), np.zeros(coupled + 1)
-        self._to = J_places[own_rows, own_columns]
-        self._diagonal = np.diagonal(W_places).copy()
+        self._hessian_places = of_W = HessianPlaces(i, j, n)
+        self.J, self.W = np.zeros(of_J.count + 1), np.zeros(of_W.count + 1)
+        self._to = of_J.at(own_rows, own_columns)
+        self._diagonal = of_W.at(np.arange(n), np.arange(n))
         self._products: list[Products] = []
         self._adapt(jacobian, hessian, equal, groups)
-        # stages name entries in either triangle
-        W_places[j, i] = W_places[i, j]
         self._stages = [
-            elimination_stage(same, J_places, W_places) for found in systems for same in same_shapes(found)
+            elimination_stage(same, of_J, of_W) for found in systems for same in same_shapes(found)
         ]
 
         # what remains
         self.pattern = couples[np.ix_(self.free, self.free)]
         of_left = touches[np.ix_(self._left, self.free)]
         self.remaining_equalities = [
-            (np.flatnonzero(t), J_places[k, self.free[t]]) for k, t in zip(self._left, of_left, strict=True)
+            (np.flatnonzero(t), of_J.at(k, self.free[t])) for k, t in zip(self._left, of_left, strict=True)
         ]
         # The Newton system adds a penalty, A' diag(w) A, so they couple as inequalities do.
         for columns, _ in self.remaining_equalities:

@@ -77,8 +77,8 @@ while data.time < time[-1] + 0.5:
 print(f"impulse {{impulse:.3f}} N s, planned {{float(ref['impulse']):.3f}} N s")
 {after}'''
 NAIL = """\
-    depth = nail_depth + data.joint("target").qpos
-    model.joint("target").frictionloss = nail_resistance + nail_hardening * depth
+    nail_now = nail_depth + data.joint("target").qpos
+    model.joint("target").frictionloss = nail_resistance + nail_hardening * nail_now
 """
 BOARD = """\
     if stiffness_board * data.joint("target").qpos[0] > breaking_force:  # from then on two free halves

@@ -153,7 +153,8 @@ class Solution(solution.Solution):
         Columns are phase (0 swing, 1 collision, 2 follow-through); position q [rad], velocity v, acceleration
         a and torque [N m] of each joint; and, of a robot on soles, force fx, fy, fz [N] and moment mx, my, mz
         [N m] of the ground about the world's origin. In collision the reference coasts: the table is without
-        the impact's forces and what they change, which `collision` has.
+        the impact's forces and what they change, which `collision` has. Times stand twice where it jumps, at
+        the beginning and the end of contact.
 
         missed : the motion for a missed target, with the abort motion.
 

@@ -309,7 +309,7 @@ def _binding(family: ParametricProgram) -> tuple[Binding, ...]:
         if measure is not None and measure.over is not None:
             factor /= max(float(measure.over.evaluate(system.x)[0]), measure.least)
         # A multiplier's sign is the side of its bound; relaxing outward never costs.
-        if (price := abs(multiplier) / (scale * factor)) > least:
+        if (price := float(abs(multiplier)) / (scale * factor)) > least:
             out.append(Binding(row=name, price=price, unit=unit))
 
     # At an interior point slack x multiplier is the barrier, for inactive constraints too: a multiplier that

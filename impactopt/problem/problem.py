@@ -351,11 +351,11 @@ class ImpactProblem:
         return next((s.abort_after for s in self.scenarios if s.abort_after is not None), None)
 
     def term(self, kind: type[AnyTerm]) -> AnyTerm:
-        """Term of a kind: the problem's own, or the default."""
+        """Term of a kind: the problem's own, or the default; InputError if it has neither (`extra`)."""
         for t in (*self.terms, *DEFAULT_TERMS, *ON_DEMAND_TERMS):
             if isinstance(t, kind):
                 return t
-        raise InputError(f"unknown kind of term {kind.__name__}")
+        raise InputError(f"the problem has no term {kind.__name__}; add one to its `terms`")
 
     def extra(self, kind: type[AnyTerm]) -> AnyTerm | None:
         """The problem's own term of a kind; None if it has none."""

@@ -88,7 +88,7 @@ def compare(records: Mapping[str, Record]) -> Comparison:
     InputError : fewer than two, or more than `MOST`.
     """
     if not 2 <= len(records) <= MOST:
-        raise InputError(f"{len(records)} results to compare; give 2 to {MOST}")
+        raise InputError(f"give 2 to {MOST} results to compare, not {len(records)}")
     summaries = [record.summary for record in records.values()]
     versions = [{str(k): str(v) for k, v in s.get("versions", {}).items()} for s in summaries]
     return Comparison(

@@ -79,6 +79,7 @@ def test_a_shadow_price_is_what_the_bound_is_worth(arm: Solution) -> None:
     assert sum(b.price for b in torques) == pytest.approx(found.objective * percent, rel=1e-3)
     assert {b.unit for b in torques} == {"%"}
     prices = [b.price for b in found.binding]
+    assert {type(price) for price in prices} == {float}  # not NumPy's, whose name stands in a repr
     assert all(price > 0 for price in prices) and prices == sorted(prices, reverse=True)
     # no constraint that an interior point keeps at a distance, and durations in their unit
     assert len(found.binding) < 20

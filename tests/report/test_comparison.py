@@ -123,7 +123,7 @@ def test_a_strike_has_numbers_and_no_histories(records: dict[str, Record]) -> No
 
 @pytest.mark.parametrize("count", [1, 6])
 def test_too_few_and_too_many_are_refused(records: dict[str, Record], count: int) -> None:
-    with pytest.raises(InputError, match=f"{count} results to compare; give 2 to 5"):
+    with pytest.raises(InputError, match=f"give 2 to 5 results to compare, not {count}"):
         compare({str(k): records["one"] for k in range(count)})
 
 

@@ -238,7 +238,9 @@ def test_a_door_hides_the_robot_from_no_side_of_a_sheet() -> None:
 
 # ---- in a browser
 
-WIDE = "document.documentElement.scrollWidth <= innerWidth"
+# neither the page nor a table in it is wider than the window
+WIDE = """[document.documentElement, ...document.querySelectorAll('.scroll')].every(
+  x => x.scrollWidth <= x.clientWidth)"""
 THEME = "document.documentElement.dataset.theme"
 PAPER = "getComputedStyle(document.body).backgroundColor"
 # what of the canvas is drawn, as a share, right after it is drawn

@@ -77,7 +77,8 @@ while data.time < time[-1] + 0.5:
 print(f"impulse {{impulse:.3f}} N s, planned {{float(ref['impulse']):.3f}} N s")
 {after}'''
 NAIL = """\
-    model.joint("target").frictionloss = resistance + hardening * (depth + data.joint("target").qpos)
+    nail_now = nail_depth + data.joint("target").qpos
+    model.joint("target").frictionloss = nail_resistance + nail_hardening * nail_now
 """
 BOARD = """\
     if stiffness_board * data.joint("target").qpos[0] > breaking_force:  # from then on two free halves
@@ -334,7 +335,8 @@ def _player(problem: ImpactProblem) -> str:
     numbers, before, target = dict(problem.law.parameters), "", problem.target
     if isinstance(target, Nail) and target.hardening:
         before = NAIL
-        numbers |= {name: target.parameters[name] for name in ("resistance", "hardening", "depth")}
+        # a law may have a parameter of the same name
+        numbers |= {f"nail_{name}": target.parameters[name] for name in ("resistance", "hardening", "depth")}
     if isinstance(target, Board):
         before = BOARD
         numbers |= {"stiffness_board": target.stiffness, "breaking_force": target.breaking_force}

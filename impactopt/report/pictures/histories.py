@@ -150,7 +150,7 @@ def draw_torque(figure: FigureBase, record: Record) -> None:
         axes.grid(False)
         axes.set(
             xlabel="time since contact [ms]" if k == 1 else "time [s]",
-            title=f"{'contact' if k == 1 else PHASES[k]}: at most {ratio.max():.2f}",
+            title=f"{'contact' if k == 1 else PHASES[k]}\nat most {ratio.max():.2f}",
         )
     panels[0].set_yticks(np.arange(len(names)), names, fontsize=6.5)
     panels[0].invert_yaxis()

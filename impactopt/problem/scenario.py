@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.arrays import Array
-from impactopt.contact.fields import Described, about, abouts, described
+from impactopt.contact.fields import Described, about, abouts, described, snake_case
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.contact.targets.base import scaled_numbers
@@ -87,7 +87,11 @@ def check_second(problem: Any) -> None:
         if isinstance(thing, (HitCone, HitRegion, Slide, PeakForce, Penetration)) or (
             getattr(thing, "first_instant", False)
         ):
-            raise InputError(f"{type(thing).__name__} is for one striker: leave it out, or the second one")
+            name, section = type(thing).__name__, "objectives" if thing in p.objectives else "terms"
+            raise InputError(
+                f"{name}, in a file [{section}.{snake_case(name)}], is for one striker: leave it out, or the "
+                "second one"
+            )
 
 
 # [s] of a phase: no servo is faster; an impact's motion takes about a second, and more is milliseconds

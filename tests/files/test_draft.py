@@ -170,6 +170,14 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
             _drafted(tmp_path, text, motion=motion)
 
 
+def test_a_bolted_robot_with_arms_and_legs_strikes_with_an_arm(tmp_path: Path) -> None:
+    """Its legs have more joints than its arms; where there are no arms, it strikes with a leg."""
+    for arms, length in ((True, 3), (False, 6)):
+        (tmp_path / "robot.urdf").write_text(urdfs.biped(arms=arms))
+        bolted = draft_robot(tmp_path / "robot.urdf", bolted=True)
+        assert [len(limb.own) for limb in bolted.arms] == [length, length]
+
+
 @pytest.mark.slow
 def test_legs_that_hang_below_the_ground_when_bolted_are_told(tmp_path: Path) -> None:
     """The message was only that no target is found. On a mount of a metre there is one."""

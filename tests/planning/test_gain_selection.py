@@ -283,10 +283,11 @@ def test_a_factor_leaves_a_choice(factor: tuple[float, float]) -> None:
         GainFactor(joints=("wrist",), factor=factor)
 
 
-def test_one_number_as_a_factor_is_refused_with_the_function_that_takes_it() -> None:
+@pytest.mark.parametrize("factor", [0.5, np.int64(2)])
+def test_one_number_as_a_factor_is_refused_with_the_function_that_takes_it(factor: Any) -> None:
     """A file takes one, so a user tries it here, too."""
     with pytest.raises(InputError, match="for one number take scaled_gains"):
-        GainFactor(joints=("wrist",), factor=0.5)  # type: ignore[arg-type]
+        GainFactor(joints=("wrist",), factor=factor)
 
 
 @pytest.mark.parametrize(

@@ -580,6 +580,7 @@ def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path, monkeypatch: pytes
     """At least 0.8 of the best of 20 strikes elsewhere, at points and normals that are drawn here."""
     monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
     problem = _problem(tmp_path, urdfs.arm())
+    assert problem.near_contact == "contact", "its posture, from which plans of the file start"
     drafted, model = _strike(problem), problem.robot.model
     rng, data, elsewhere = np.random.default_rng(1), model.createData(), []
     frame = model.getFrameId(f"striker:{problem.striker}")

@@ -365,6 +365,8 @@ def collide_once(
     head: dict[str, Any] = {"problem": content.problem.name or file.path.stem, "robot": robot.name}
     head |= {"model": section.model}
     head |= {"freezes": section.freezes} if section.model == "sdc" else {}
+    if isinstance(model, RigidImpact):
+        head["coefficient_of_restitution"] = model.coefficient_of_restitution
     point = tuple(map(float, content.problem.point))
     posture = states.posture(section.posture, section.result, point)
     if isinstance(posture, str):

@@ -130,15 +130,16 @@ def slide_caution(problem: ImpactProblem, length: float) -> str:
     )
 
 
-def nail_caution(problem: ImpactProblem, plan: Plan) -> str:
+def nail_caution(problem: ImpactProblem, plan: Plan | PlannedStrike) -> str:
     """Warning about a nail that hardly moves; "" of other targets, and of one that does."""
     # A nail that just starts to move takes no energy, and a little more speed does not change that to first
     # order: it can be a local optimum.
     if not isinstance(problem.target, Nail) or plan.collision.outcome["depth_m"] > _DRIVEN:
         return ""
+    guess = "the initial guess 'strike' (`--start strike`)" if isinstance(plan, Plan) else "another `--seed`"
     return (
-        "The nail is not driven into the wood. With the objective target_energy, the initial guess 'strike' "
-        "(`--start strike`) may find a harder blow; else take a smaller resistance."
+        f"The nail is not driven into the wood. With the objective target_energy, {guess} may find a harder "
+        "blow; else take a smaller resistance."
     )
 
 

@@ -20,7 +20,13 @@ from impactopt.planning.clearance_constraints import (
 )
 from impactopt.planning.diagnosis import with_reason
 from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
-from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, lazy_terms_of, with_lazy_constraints
+from impactopt.planning.lazy_constraints import (
+    LazyTerms,
+    gear_caution,
+    lazy_terms_of,
+    nail_caution,
+    with_lazy_constraints,
+)
 from impactopt.planning.models import carried_start, check_start, with_order, with_order_of
 from impactopt.planning.multistart import Guesses, best_of, best_of_starts, check_starts, drawn_guesses
 from impactopt.planning.refinement import Additions, Guess, Outcome, carried, program_for, refine
@@ -57,8 +63,10 @@ class StrikeSolution(Solved):
         hit = self.strike
         loads, names = hit.loads(), self.problem.robot.joint_names
         angles = self.problem.robot.joint_positions(hit.posture)
+        caution = " ".join(filter(None, [self.caution, nail_caution(self.problem, hit)]))
         return {
             **self.outcome(),
+            **({"caution": caution} if caution else {}),
             **impact_summary(hit, hit.collision, self.contact_replay),
             "objectives": dict(self.objectives),
             **hit.margins(),

@@ -15,6 +15,7 @@ import pinocchio as pin
 
 from impactopt.arrays import Array
 from impactopt.bodies.world import Ground, Obstacle, TargetBody
+from impactopt.contact.fields import snake_case
 from impactopt.contact.friction import check_friction, moves_target
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import Board, FreeMass, RigidWall, Target
@@ -223,7 +224,11 @@ def check_second(problem: Any) -> None:
         if isinstance(thing, (HitCone, HitRegion, Slide, PeakForce, Penetration)) or (
             getattr(thing, "first_instant", False)
         ):
-            raise InputError(f"{type(thing).__name__} is for one striker: leave it out, or the second one")
+            name, section = type(thing).__name__, "objectives" if thing in p.objectives else "terms"
+            raise InputError(
+                f"{name}, in a file [{section}.{snake_case(name)}], is for one striker: leave it out, or the "
+                "second one"
+            )
 
 
 def check_strikers(problem: Any) -> None:

@@ -89,6 +89,8 @@ class ImpactProblem:
         With phases, `stance` is that of the phase with the impact.
     start : posture at the start of the motion, at rest: a name of ``robot.postures`` or a pin configuration
         (nq,).
+    near_contact : likewise a posture from which the first initial guess at contact is found, by inverse
+        kinematics; None: it is chosen. Plans do not depend on it but by their local optimum.
     swing, follow : phases from rest to contact, and from contact to rest (follow-through).
     contact_duration : (shortest, longest) [s], of each of compression (of a nail: until it stops) and
         restitution. A phase that ends by an event, such as a board's break, may be shorter. If the shortest
@@ -142,6 +144,7 @@ class ImpactProblem:
     stance: Stance = field(default_factory=BothSoles)
     stances: tuple[StancePhase, ...] = ()
     start: str | Array = USUAL_POSTURE
+    near_contact: str | Array | None = None
     swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
     follow: Phase = field(default_factory=lambda: Phase(duration=(1.0, 1.0)))
     contact_duration: tuple[float, float] = (0.0, 0.2)
@@ -266,6 +269,9 @@ class ImpactProblem:
         posture = self.start_posture
         if not isinstance(self.start, str):  # a copy, which does not follow the caller's array
             object.__setattr__(self, "start", posture.copy())
+        if self.near_contact is not None and not isinstance(self.near_contact, str):
+            near = self.robot.check_configuration(self.near_contact, name="near_contact")
+            object.__setattr__(self, "near_contact", near)
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, [sole.name for sole in self.soles])
         first = self.stance_coordinates[0]
@@ -369,9 +375,7 @@ class ImpactProblem:
     @cached_property
     def start_posture(self) -> Array:
         """Start posture, a pin configuration (nq,)."""
-        if isinstance(self.start, str):
-            return np.array(self.robot.posture(self.start))
-        return self.robot.check_configuration(self.start, name="the start posture")
+        return self.robot.given_posture(self.start, name="the start posture")
 
     @property
     def coordinates(self) -> StanceCoordinates:
@@ -438,13 +442,17 @@ class ImpactProblem:
 
     @cached_property
     def contact_posture(self) -> Array:
-        """Posture (nq,) at contact, as of `contact_posture_near` the posture in which the last stance begins.
+        """Posture (nq,) at contact, as of `contact_posture_near` the given posture near it, or that in which
+        the last stance begins.
 
         Raises
         ------
         InputError : the point is out of reach.
         """
-        return self.contact_posture_near(self.change_posture(self.blow - 1))
+        if self.near_contact is None:
+            return self.contact_posture_near(self.change_posture(self.blow - 1))
+        near = self.robot.given_posture(self.near_contact, name="near_contact")
+        return self.contact_posture_near(near)
 
     def contact_posture_near(self, guess: Array) -> Array:
         """Posture (nq,) with the strikers at their points and the soles in place, by inverse kinematics from

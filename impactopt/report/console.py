@@ -182,6 +182,8 @@ def strike_table(summary: Mapping[str, Any]) -> Table:
 def collision_table(found: Mapping[str, Any]) -> Table:
     """Table of one collision and those of a saved result; `found` as in `impactopt collide --json`."""
     model = f"{found['model']}, freezes = {found['freezes']}" if found.get("freezes") else found["model"]
+    if "coefficient_of_restitution" in found:
+        model += f", restitution = {found['coefficient_of_restitution']:g}"
     table = _empty(f"{found['problem']}: {model}", "", "collision", *(found.get("saved") or {}))
     notes = [f"caution: {found[key]}" for key in ("caution", "again", "drifts") if found.get(key)]
     notes += [f"{found['model']}: {found['believe']}"] if "believe" in found else []

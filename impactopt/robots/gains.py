@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from numbers import Real
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class GainFactor:
         if not listed or not self.joints or not all(isinstance(name, str) for name in self.joints):
             raise InputError(f"GainFactor: joints are names or patterns, at least one, not {self.joints!r}")
         object.__setattr__(self, "joints", tuple(self.joints))
-        given = (self.factor, self.factor) if isinstance(self.factor, (int, float)) else self.factor
+        given = (self.factor, self.factor) if isinstance(self.factor, Real) else self.factor
         least, largest = check_array("GainFactor: factor", given, (2,)).tolist()
         if not MIN_FACTOR <= least < largest <= MAX_FACTOR:
             raise InputError(

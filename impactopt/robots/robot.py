@@ -418,6 +418,12 @@ class Robot:
         """A named configuration, (nq,), as a copy."""
         return build.pick("posture", name, self.postures, self.name).copy()
 
+    def given_posture(self, given: str | ArrayLike, *, name: str) -> Array:
+        """A configuration (nq,), given by its name or itself, as a copy; InputError as of
+        `check_configuration`, or for an unknown name.
+        """
+        return self.posture(given) if isinstance(given, str) else self.check_configuration(given, name=name)
+
     def with_striker(self, striker: Striker) -> Robot:
         """A copy of the robot with `striker`, which replaces one of the same name."""
         check_kind("striker", striker, Striker)

@@ -243,6 +243,7 @@ def test_a_collision_that_there_is_not_exits_1(file: Path) -> None:
 def test_a_rigid_impact_has_no_peak_force(file: Path) -> None:
     out, _ = run("collide", file, "--speed", 0.5, "--model", "rigid")
     assert "no peak force" in out and "peak force [N]" not in out
+    assert "rigid, restitution = 0\n" in re.sub(" +\n", "\n", out), "the file gives none"
     found = json.loads(run("collide", file, "--speed", 0.5, "--model", "rigid", "--json")[0])
     assert found["peak_force_N"] is None and found["impulse_Ns"] > 0
 

@@ -170,6 +170,14 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
             _drafted(tmp_path, text, motion=motion)
 
 
+def test_a_bolted_robot_with_arms_and_legs_strikes_with_an_arm(tmp_path: Path) -> None:
+    """Its legs have more joints than its arms; where there are no arms, it strikes with a leg."""
+    for arms, length in ((True, 3), (False, 6)):
+        (tmp_path / "robot.urdf").write_text(urdfs.biped(arms=arms))
+        bolted = draft_robot(tmp_path / "robot.urdf", bolted=True)
+        assert [len(limb.own) for limb in bolted.arms] == [length, length]
+
+
 @pytest.mark.slow
 def test_legs_that_hang_below_the_ground_when_bolted_are_told(tmp_path: Path) -> None:
     """The message was only that no target is found. On a mount of a metre there is one."""
@@ -572,6 +580,7 @@ def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path, monkeypatch: pytes
     """At least 0.8 of the best of 20 strikes elsewhere, at points and normals that are drawn here."""
     monkeypatch.setattr(strong, "MAX_STRIKES", MAX_STRIKES)
     problem = _problem(tmp_path, urdfs.arm())
+    assert problem.near_contact == "contact", "its posture, from which plans of the file start"
     drafted, model = _strike(problem), problem.robot.model
     rng, data, elsewhere = np.random.default_rng(1), model.createData(), []
     frame = model.getFrameId(f"striker:{problem.striker}")

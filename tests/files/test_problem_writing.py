@@ -224,6 +224,20 @@ def test_any_problem_comes_back(nailing: ImpactProblem, changes: dict[str, Any],
     assert_same(back(write_problem(problem)), problem)
 
 
+@pytest.mark.parametrize("near", ["ready", "of its own"])
+def test_a_posture_near_contact_comes_back(nailing: ImpactProblem, near: str) -> None:
+    given = near if near == "ready" else nailing.contact_posture
+    problem = dataclasses.replace(nailing, near_contact=given)
+    assert_same(back(text := write_problem(problem)), problem)
+    assert ('near_contact = "ready"' in text) is (near == "ready")
+
+
+def test_an_unknown_posture_near_contact_is_named_with_its_line(nailing: ImpactProblem) -> None:
+    text = write_problem(dataclasses.replace(nailing, near_contact="ready"))
+    with pytest.raises(InputError, match=r"near_contact(.|\n)*did you mean 'ready'"):
+        back(text.replace('near_contact = "ready"', 'near_contact = "redy"'))
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_terms_that_only_some_problems_have_come_back(nailing: ImpactProblem, name: str) -> None:
     motor = impactopt.Actuator(stall_torque=200.0, no_load_speed=10.0)  # for the term that is about motors

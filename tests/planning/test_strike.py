@@ -29,6 +29,8 @@ from impactopt import (
     Impulse,
     Incidence,
     InputError,
+    KelvinVoigt,
+    Nail,
     Obstacle,
     PeakForce,
     Phase,
@@ -325,6 +327,13 @@ def test_a_strike_starts_another_without_its_obstacle(arm_transcription: Transcr
     first = optimize_strike(dataclasses.replace(p, obstacles=(rod,), collision="sdc"))
     assert first.clearance_constraints
     assert optimize_strike(p, start=first).status is Status.SOLVED
+
+
+def test_a_strike_that_does_not_drive_its_nail_is_told(arm_transcription: Transcription) -> None:
+    nail, law = Nail(mass=0.05, resistance=1e5, hardening=1e4), KelvinVoigt(stiffness=1e5, damping=100.0)
+    problem = dataclasses.replace(arm_transcription.problem, target=nail, law=law)
+    found = optimize_strike(problem, options={"max_iterations": 3})
+    assert "nail is not driven" in found.summary()["caution"]
 
 
 # ---- several starts

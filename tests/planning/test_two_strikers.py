@@ -281,8 +281,8 @@ def test_what_two_cannot_do_is_refused(problem: ImpactProblem) -> None:
     for changes, told in (
         ({"collision": "sdc"}, 'collision="full"'),
         ({"target": Board(mass=1.0, stiffness=1e4, breaking_force=100.0)}, "FreeMass or a RigidWall"),
-        ({"terms": (*problem.terms, HitCone(angle=0.1))}, "for one striker"),
-        ({"objectives": (PeakForce(weight=-1.0),)}, "for one striker"),
+        ({"terms": (*problem.terms, HitCone(angle=0.1))}, r"\[terms.hit_cone\], is for one striker"),
+        ({"objectives": (PeakForce(weight=-1.0),)}, r"\[objectives.peak_force\], is for one striker"),
         ({"second": SecondStriker(striker="right_hand", point=second.point)}, "limb of its own"),
         ({"second": SecondStriker(striker="left_hnd", point=second.point)}, "left_hand"),
         ({"second": SecondStriker(striker="left_hand", point=np.array([0.5, 3.0, 1.0]))}, "out of reach"),

@@ -25,6 +25,7 @@ from impactopt import (
     solve,
 )
 from impactopt.bodies.robot_bodies import bodies_of, striker_face
+from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import (
     MAX_BEYOND,
@@ -76,6 +77,18 @@ def _aside(*shift: float) -> ImpactProblem:
     hand = problem.extra(HandOrientation)
     assert hand is not None and _off(problem, problem.contact_posture)[1] <= hand.angle
     return problem
+
+
+def test_a_posture_given_near_contact_goes_first() -> None:
+    problem = _aside()
+    other = strongest_posture(problem, 1)
+    given = replace(problem, near_contact=other)
+    assert np.abs(strongest_posture(problem) - other).max() > 0.1
+    assert np.array_equal(strongest_posture(given), given.contact_posture)
+    np.testing.assert_allclose(given.contact_posture, other, atol=0.2)
+    assert not np.array_equal(strongest_posture(given, 2), other), "further starts have others"
+    with pytest.raises(InputError, match="near_contact"):
+        replace(problem, near_contact=other[1:])
 
 
 def test_further_starts_have_other_postures() -> None:

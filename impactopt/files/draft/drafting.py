@@ -53,7 +53,7 @@ WORTH_A_PLAN = 1.05
 SLIGHT = 0.35  # component of a direction that is not named in words: 20 degrees
 MAX_STROKES = 3  # targets of a robot on legs, below its hand, that a strike is tried to
 SHIFT = (0.6, 1.2)  # duration [s] from two feet to one, and back
-START = "ready"
+START, AT_CONTACT = "ready", "contact"  # postures
 FROM_ABOVE = ("chop", "nail")
 MOTIONS = ("punch", "kick", *FROM_ABOVE)
 UNSOLVED = "none of the strikes tried is solved: if `solve` finds no motion, move the target or ease it"
@@ -326,6 +326,7 @@ def _aimed_strike(
     for phase, bounds in durations(robot, way).items():
         data[phase]["duration_s"] = list(bounds)
     data = _edgewise(data) if edgewise else data
+    data["robot"]["postures_rad"][AT_CONTACT] = _angles(robot, strong.contact)
     return _aimed(data, arm.name, iter([strong.point]), strong.normal, case.folder)
 
 
@@ -495,8 +496,7 @@ def _data(case: _Case, robot: Robot, q: Array) -> dict[str, Any]:
         keys["soles"] = [sole_data(sole) for sole in soles]
     keys["strikers"] = [section_data(StrikerSection, striker) for striker in case.strikers]
     keys |= {"tools": [section_data(ToolSection, tool) for tool in robot.tools]} if robot.tools else {}
-    angles = zip(robot.joint_names, robot.joint_positions(q), robot.hinges, strict=True)
-    keys["postures_rad"] = {START: {joint: round(float(x), 5) for joint, x, hinge in angles if not hinge}}
+    keys["postures_rad"] = {START: _angles(robot, q)}
     mass = sum(float(body.mass) for body in robot.model.inertias)
     data: dict[str, Any] = {
         "problem": {"name": f"first strike of {robot.name}", "start": START},
@@ -526,6 +526,12 @@ def _data(case: _Case, robot: Robot, q: Array) -> dict[str, Any]:
     return plain_value(data)
 
 
+def _angles(robot: Robot, q: Array) -> dict[str, float]:
+    """Angles of a configuration (nq,) by joint, for a file."""
+    angles = zip(robot.joint_names, robot.joint_positions(q), robot.hinges, strict=True)
+    return {joint: round(float(x), 5) for joint, x, hinge in angles if not hinge}
+
+
 def _aimed(
     data: dict[str, Any], striker: str, points: Iterator[Array], way: Array, folder: Path
 ) -> tuple[dict[str, Any], ImpactProblem]:
@@ -540,8 +546,10 @@ def _aimed(
         if k == MAX_TARGETS:
             break
         normal = (np.round(way, 9) + 0.0).tolist()
-        problem = {"striker": striker, "point_m": point.tolist(), "normal": normal}
-        aimed = {**data, "problem": {"name": data["problem"]["name"], **problem, "start": START}}
+        problem = {"striker": striker, "point_m": point.tolist(), "normal": normal, "start": START}
+        if AT_CONTACT in data["robot"]["postures_rad"]:
+            problem["near_contact"] = AT_CONTACT
+        aimed = {**data, "problem": {"name": data["problem"]["name"], **problem}}
         try:
             built = _built(aimed, folder)
             wrong = hopeless(built)
@@ -592,6 +600,8 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
             return guessed[str(place[1])]
         if place == ("robot", "postures_rad", START):
             return "soles level, knees forward, arms bent" if data["robot"].get("soles") else "bent"
+        if place == ("robot", "postures_rad", AT_CONTACT):
+            return "of the strike for which the target is placed"
         if place == ("problem", "normal"):
             return f"{comment_at(data, place)}: {_in_words(np.array(data['problem']['normal']))}"
         if known and place in (("terms", "joint_acceleration"), ("terms", "joint_jerk")):

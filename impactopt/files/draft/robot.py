@@ -14,7 +14,17 @@ from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.draft.default_drives import RANGE, Drives, guess_drives
-from impactopt.files.draft.limbs import Limb, arms_of, legs_of, limbs_of, range_of, to_lock, toes, unshared
+from impactopt.files.draft.limbs import (
+    Limb,
+    arms_of,
+    legs_of,
+    limbs_of,
+    range_of,
+    renumbered,
+    to_lock,
+    toes,
+    unshared,
+)
 from impactopt.robots.build import ROOT, is_floating, lock_joints, neutral
 from impactopt.robots.checks import LEG, REPAIRED, check_inertias
 from impactopt.robots.couplings import unfit
@@ -148,6 +158,8 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if floats and not legs:
         found = _made(path, mjcf, False, locked)
     arms = arms_of(found.robot.model, legs)
+    if bolted:  # a punch with a foot is for robots without arms
+        arms = arms_of(found.robot.model, _legs_if_free(found))
     if idle := {} if legs else _idle(found.robot.model, arms):
         found = _made(path, mjcf, False, {**found.locked, **idle})
         arms = arms_of(found.robot.model, legs)
@@ -155,6 +167,19 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
         raise InputError(f"{path}: there is no limb to strike with")
     fixed = mjcf and not legs and not bolted and is_floating(read_mjcf(path).model)
     return replace(found, legs=legs, arms=arms, fixed=fixed, turn=turn)
+
+
+def _legs_if_free(found: Drafted) -> tuple[Limb, ...]:
+    """Limbs of a bolted robot that would be its legs if it had a free root, unless no arm is left beside
+    them.
+    """
+    free, bolted = _floating(found.path, found.mjcf, False)[0].model, found.robot.model
+    if not is_floating(free):
+        return ()
+    free = lock_joints(free, found.options["locked"])
+    legs = legs_of(free, {joint + 1: pieces for joint, pieces in found.pieces.items()})
+    legs = tuple(renumbered(leg, free, bolted) for leg in legs)
+    return legs if any(len(arm.own) > 1 for arm in arms_of(bolted, legs)) else ()
 
 
 def _turn(found: Drafted) -> str:

@@ -180,6 +180,7 @@ def strike_problem(
                 normal=impact.normal,
                 stance=FixedBase(),
                 start=start,
+                near_contact=impact.q,
                 **given,
             )
             if problem.bodies.overlaps or touches(problem, start, impact.q):

@@ -141,6 +141,8 @@ def _built_robot(content: File, folder: Path, mistakes: Collector) -> tuple[Robo
         return None, None
     mistakes.attempt(("problem", "striker"), lambda: robot.striker(content.problem.striker))
     mistakes.attempt(("problem", "start"), lambda: content.make_start(robot))
+    if (near := content.problem.given().get("near_contact")) is not None:
+        mistakes.attempt(("problem", "near_contact"), partial(robot.given_posture, near, name="near_contact"))
     for k, phase in enumerate(content.stances or ()):
         for sole in phase.soles:
             mistakes.attempt(("stances", k, "soles"), partial(robot.sole, sole))

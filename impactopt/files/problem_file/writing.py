@@ -210,9 +210,13 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     if problem.gains:
         robot["gains"] = [{"joints": list(g.joints), "factor": list(g.factor)} for g in problem.gains]
     preset_only = robot.keys() == {"preset"}
-    start = problem.start
-    if not isinstance(start, str) or not _equal(built.postures.get(start), problem.start_posture):
-        start = problem.start_posture.tolist()
+    postures = {"start": problem.start} | (
+        {} if problem.near_contact is None else {"near_contact": problem.near_contact}
+    )
+    for key, given in postures.items():
+        q = problem.robot.given_posture(given, name=key)
+        if not isinstance(given, str) or not _equal(built.postures.get(given), q):
+            postures[key] = q.tolist()
     data: dict[str, Any] = {
         "problem": {
             **_different(ProblemSection, {"name": problem.name}),
@@ -220,7 +224,7 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
             "striker": problem.striker,
             "point_m": problem.point.tolist(),
             "normal": problem.normal.tolist(),
-            **_different(ProblemSection, {"start": start}),
+            **_different(ProblemSection, postures),
         },
         **({} if preset_only else {"robot": robot}),
         "target": target_data(problem.target),

@@ -116,6 +116,9 @@ class ProblemSection(Section):
     )
     normal: UnitVector = required("direction in which the target is pushed")
     start: Posture = usual(USUAL_POSTURE, "start posture: its name, or a configuration of Pinocchio")
+    near_contact: Posture = optional(
+        "posture near which the first initial guess is at contact, given likewise"
+    )
 
 
 class StanceSection(Section):
@@ -300,7 +303,4 @@ class CollisionSections(Section):
 
     def make_start(self, robot: Robot) -> Array:
         """The start posture (nq,); InputError for one that the robot cannot have."""
-        start = self.problem.start
-        return (
-            robot.posture(start) if isinstance(start, str) else robot.check_configuration(start, name="start")
-        )
+        return robot.given_posture(self.problem.start, name="start")

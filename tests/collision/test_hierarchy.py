@@ -166,7 +166,7 @@ def test_histories_of_several_freezes_go_on_from_one_to_the_next():
 
 
 @pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
-@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("compiled", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_histories_end_at_separation_in_whichever_segment_it_is(compiled, monkeypatch):
     """Here before the last, as the trial that divides the contact has taken it to be longer."""
     if not compiled:

@@ -1345,6 +1345,7 @@ def _walker(folder: Path) -> Path:
     return xml
 
 
+@pytest.mark.slow
 def test_a_walker_with_weak_arms_starts_as_they_can_hold_them(tmp_path: Path) -> None:
     """Bent ahead they needed more than their torque limits."""
     weak = r'(<joint name="(?:left|right)_(?:shoulder|elbow)\w*".*?effort=")[\d.]+'

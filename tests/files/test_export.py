@@ -389,6 +389,7 @@ def test_a_smoothed_motion_may_be_for_a_target_that_does_not_break(tmp_path: Pat
     assert json.loads(done.stdout)["caution"].endswith("in the files are of it, the motion is the plan's")
 
 
+@pytest.mark.slow
 def test_feed_forward_beyond_the_torque_limit_is_told(
     filed: Record, planned: Planned, tmp_path: Path
 ) -> None:

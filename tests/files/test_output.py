@@ -356,6 +356,7 @@ def test_a_place_that_cannot_be_a_directory(record: Record, tmp_path: Path) -> N
         save_record(record, tmp_path)
 
 
+@pytest.mark.slow
 def test_pictures_of_a_record(record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(STYLE, "savefig.dpi", DPI / 10)  # to be written sooner
     written = save_pictures(record, tmp_path)

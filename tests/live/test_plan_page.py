@@ -316,6 +316,7 @@ def test_a_record_of_an_older_version_shows_no_coasting_robot(arm: Solution) -> 
 # ---- from a saved result
 
 
+@pytest.mark.slow
 def test_a_saved_result_is_a_start_again(arm: Solution, saved: Path) -> None:
     record = load_record(saved)
     again = resumed(record, problem_of(record, saved))

@@ -109,6 +109,7 @@ def test_a_bent_plan_is_that_of_the_changed_problem(arm: Solution, changes: dict
     assert first.result.iterations <= 5 and "first-order" in first.result.message
 
 
+@pytest.mark.slow
 def test_a_refined_plan_has_the_loads_of_a_solved_one(arm: Solution) -> None:
     """Between the collocation points a gear load is larger than at them."""
     bent = arm.moved(mass=0.06, refine=True)

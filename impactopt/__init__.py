@@ -58,17 +58,22 @@ _PUBLIC = {
 }
 _EXPORTS = {name: module for module, names in _PUBLIC.items() for name in names}
 
-# families: the classes of their modules
-_FAMILIES = ("contact.laws", "contact.targets", "problem.objectives", "problem.terms")
+# families: a module, and the class whose subclasses there are public
+_FAMILIES = {
+    "contact.laws": "ContactLaw",
+    "contact.targets": "Target",
+    "problem.objectives": "Objective",
+    "problem.terms": "Term",
+}
 
 
 def _all_exports() -> dict[str, str]:
     """Public name -> module, those of the families too, which are imported for it."""
     found = dict(_EXPORTS)
-    for module in _FAMILIES:
+    for module, base in _FAMILIES.items():
         family = importlib.import_module(f"impactopt.{module}")
         classes = {name: thing for name, thing in vars(family).items() if isinstance(thing, type)}
-        own = {name for name, kind in classes.items() if kind.__module__.startswith(family.__name__)}
+        own = {name for name, kind in classes.items() if issubclass(kind, vars(family)[base])}
         found |= dict.fromkeys(own, module)
     return found
 

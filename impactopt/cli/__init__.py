@@ -1,1 +1,1 @@
-"""Command line: one file a command, registered in `app.py`; `options.py` has shared options."""
+"""Command line: one file a command, registered in `app.py`; `command.py` has what all share."""

@@ -27,7 +27,7 @@ import pinocchio as pin
 from scipy.linalg.lapack import dgesv
 
 from impactopt.arrays import Array, Index, Mask
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_array
 from impactopt.robots.build import joint_indices
 from impactopt.robots.checks import LEG, check_arms, check_legs
 from impactopt.robots.model import JointAngles, RpyCoordinates
@@ -554,7 +554,7 @@ class StanceCoordinates:
         Angles without limits are the equivalent ones nearest to those of the given posture. Else a robot
         whose root faces backwards, with a yaw of pi, would turn round once in a motion across it.
         """
-        q = self._rpy.from_pin(q_pin)
+        q = self._rpy.from_pin(self.robot.check_configuration(q_pin))
         turns = 2 * np.pi * np.round((self._rpy.from_pin(self.posture) - q) / (2 * np.pi))
         q = q + np.where(self._unlimited, turns, 0.0)
         joints = q[self.base :]
@@ -571,7 +571,8 @@ class StanceCoordinates:
         """Pinocchio configuration (nq,) of y (ny,) and legs (nl,), or (k, nq) of k of them."""
         joints = np.zeros((*y.shape[:-1], self.robot.n))
         joints[..., self.independent], joints[..., self.dependent] = y[..., self.base :], legs
-        return self._rpy.to_pin(np.concatenate([y[..., : self.base], joints], axis=-1))
+        q = np.concatenate([y[..., : self.base], joints], axis=-1)
+        return self._rpy.to_pin(check_array("coordinates", q, (None,) * q.ndim))  # NaN of a failed solve
 
     def solve_legs(self, y: Array, guess: Array) -> Array:
         """Leg joints (nl,) that put every fixed sole in its place, by Newton's method from ``guess``.

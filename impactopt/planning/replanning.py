@@ -128,7 +128,7 @@ def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
         (getattr(problem, f.name), getattr(other, f.name)) for f in fields(problem) if f.name not in movable
     ]
     same_fields = all(
-        one is two or (np.array_equal(one, two) if isinstance(one, np.ndarray) else one == two)
+        one is two or (np.array_equal(one, two) if np.ndarray in (type(one), type(two)) else one == two)
         for one, two in pairs
     )
     same_types = type(problem.law) is type(other.law) and type(problem.target) is type(other.target)

@@ -23,13 +23,13 @@ def problem_hash(problem: Any) -> str:
     """Hexadecimal hash of what an `ImpactProblem`'s solution depends on, but for the collision shapes of the
     robot's links (`RobotBodies.hash`), the same in every process.
 
-    It does not depend on the names of problem and robot, the order of terms and objectives, postures other
-    than the start, or on whether a default is given or left out. Numbers count to the last digit.
+    It does not depend on the names of problem and robot, the order of terms and objectives, the names of
+    postures, or on whether a default is given or left out. Numbers count to the last digit.
     """
     data = {
         f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name not in _NOT_HASHED
     }
-    second = data.pop("second")
+    second, near = data.pop("second"), data.pop("near_contact")
     # features that a problem does not use are left out, so that problems without them keep their hashes
     for name in ("stances", "friction"):
         if not data[name]:
@@ -43,6 +43,8 @@ def problem_hash(problem: Any) -> str:
     if gains := data.pop("gains"):
         each = zip(problem.gain_joints, gains, strict=True)
         data["gains"] = sorted((joints, gain.factor) for joints, gain in each)
+    if near is not None:
+        data["near_contact"] = problem.robot.given_posture(near, name="near_contact")
     if second is not None:
         other = problem.robot.striker(second.striker)
         data["second"] = (other.frame, other.point, second.point)

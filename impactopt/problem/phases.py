@@ -20,7 +20,6 @@ from impactopt.robots.robot import Robot
 _DESCENTS = np.arange(0.0, 0.21, 0.02)  # [m] of the base that are tried, in turn, for legs that do not reach
 _MAX_STEP = 2.0  # [m]: a longer step is a mistake of units
 
-
 # [s] of a phase: no servo is faster; an impact's motion takes about a second, and more is milliseconds
 SHORTEST, LONGEST = 1e-3, 60.0
 # intervals of a phase: with the middles of the intervals, a swing of 1 s has nodes at 4 kHz, as a fast servo

@@ -90,7 +90,8 @@ class ImpactProblem:
     start : posture at the start of the motion, at rest: a name of ``robot.postures`` or a pin configuration
         (nq,).
     near_contact : likewise a posture from which the first initial guess at contact is found, by inverse
-        kinematics; None: it is chosen. Plans do not depend on it but by their local optimum.
+        kinematics; None: it is chosen. Plans do not depend on it but by their local optimum; checks and
+        `minimum_jerk_baseline` take it, too.
     swing, follow : phases from rest to contact, and from contact to rest (follow-through).
     contact_duration : (shortest, longest) [s], of each of compression (of a nail: until it stops) and
         restitution. A phase that ends by an event, such as a board's break, may be shorter. If the shortest
@@ -269,9 +270,11 @@ class ImpactProblem:
         posture = self.start_posture
         if not isinstance(self.start, str):  # a copy, which does not follow the caller's array
             object.__setattr__(self, "start", posture.copy())
-        if self.near_contact is not None and not isinstance(self.near_contact, str):
-            near = self.robot.check_configuration(self.near_contact, name="near_contact")
-            object.__setattr__(self, "near_contact", near)
+        if self.near_contact is not None:
+            near = self.robot.given_posture(self.near_contact, name="near_contact")
+            self.robot.check_limits(near, name="near_contact")
+            if not isinstance(self.near_contact, str):
+                object.__setattr__(self, "near_contact", near)
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, [sole.name for sole in self.soles])
         first = self.stance_coordinates[0]
@@ -357,7 +360,7 @@ class ImpactProblem:
         return next((s.abort_after for s in self.scenarios if s.abort_after is not None), None)
 
     def term(self, kind: type[AnyTerm]) -> AnyTerm:
-        """Term of a kind: the problem's own, or the default; InputError if it has neither (`extra`)."""
+        """Term of a kind: the problem's own, or the default; InputError if it has neither."""
         for t in (*self.terms, *DEFAULT_TERMS, *ON_DEMAND_TERMS):
             if isinstance(t, kind):
                 return t

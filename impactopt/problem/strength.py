@@ -237,9 +237,9 @@ def drawn_impacts(
 def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
     """Posture at contact (nq,) for the initial guess of a motion.
 
-    seed : that of `drawn_posture`. With 0, of the first start, it is the problem's `contact_posture` if one
-        near it is given; or if a swing reaches that, and its estimate is clearly larger than that of the
-        drawn one, or a swing hardly reaches the latter.
+    seed : that of `drawn_posture`. With 0, of the first start, it is the problem's `contact_posture` if
+        `near_contact` is given; else if a swing reaches it and its estimate is clearly larger than that of
+        the drawn one, or a swing hardly reaches the latter.
     """
     if problem.near_contact is not None and not seed:
         return problem.contact_posture

@@ -1,1 +1,1 @@
-"""Reports of a result: tables and plain messages on the terminal, pictures, a page for a browser."""
+"""Reports of a result: tables on the terminal, pictures, a page for a browser."""

@@ -85,7 +85,7 @@ class ContactProgram(ABC):
         self.objectives: list[tuple[Objective, Quantity]] = []
         self.clearance_constraints: Mapping[ClearanceKey, SeparatingDirection] = {}
         self.postures: dict[int, Array] = {}
-        # without clearance constraints, but with all their couplings; made with the first ones
+        # without clearance constraints, but with all their couplings; made when the first are added
         self._base: StructuredProgram | None = None
 
     # ------------------------------------------------------------------ for terms and objectives

@@ -269,9 +269,10 @@ class HessianMap:
         """Map of these blocks and more; None if the pattern lacks one of their entries."""
         source, linear_index, length, factor = self._terms(blocks, lift, self.blocks)
         begin = np.searchsorted(self.pattern, linear_index)
-        end = (begin + length - 1).clip(max=self.pattern.size - 1)
+        # a run beyond the pattern ends where no index is
+        end = (begin + length - 1).clip(max=self.pattern.size)
         # indices ascend, so those of a run are all there if its last one is where it has to be
-        if (self.pattern[end] != linear_index + length - 1).any():
+        if (np.append(self.pattern, -1)[end] != linear_index + length - 1).any():
             return None
         sums = self.sums.with_more(source, begin, length, factor, int(_starts(blocks)[-1]))
         return replace(self, blocks=len(blocks), sums=sums)
@@ -406,7 +407,7 @@ class StructuredProgram:
 
         determined : variables that the solver can eliminate by equality constraints.
         base : program of the first blocks alone, with the same variables and Q; its Hessian's structure is
-            taken over if it has a place for those of the other blocks.
+            taken over if it has places for all entries of the other blocks' Hessians.
         """
         self._base = base
         self.determined = tuple(determined)

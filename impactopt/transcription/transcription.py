@@ -389,7 +389,7 @@ class Transcription(ContactProgram):
         other = copy.copy(self)
         other.problem = replace(self.problem, price_scale=scale)
         other._objective = assemble(other.layout, other.objectives, other._prices())
-        other._base = None  # has the quadratic of the objective
+        other._base = None  # it has the old prices
         return other.with_clearance(self.clearance_constraints)
 
     def price_shares(self, x: Array) -> tuple[float, float]:

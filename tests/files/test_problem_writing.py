@@ -55,8 +55,9 @@ def assert_same(a: ImpactProblem, b: ImpactProblem) -> None:
         x, y = getattr(a, field.name), getattr(b, field.name)
         if field.name == "robot":
             assert x.name == y.name
-        elif field.name == "start":
-            np.testing.assert_array_equal(a.start_posture, b.start_posture)
+        elif field.name in ("start", "near_contact") and x is not None:
+            postures = (p.robot.given_posture(given, name=field.name) for p, given in ((a, x), (b, y)))
+            np.testing.assert_array_equal(*postures)
         elif field.name == "terms":
             assert {type(t): a.term(type(t)) for t in terms.DEFAULT_TERMS} == {
                 type(t): b.term(type(t)) for t in terms.DEFAULT_TERMS
@@ -224,10 +225,12 @@ def test_any_problem_comes_back(nailing: ImpactProblem, changes: dict[str, Any],
     assert_same(back(write_problem(problem)), problem)
 
 
-@pytest.mark.parametrize("near", ["ready", "of its own"])
+@pytest.mark.parametrize("near", ["ready", "of its own", "of the robot alone"])
 def test_a_posture_near_contact_comes_back(nailing: ImpactProblem, near: str) -> None:
-    given = near if near == "ready" else nailing.contact_posture
-    problem = dataclasses.replace(nailing, near_contact=given)
+    robot, posture = nailing.robot, nailing.contact_posture
+    robot = dataclasses.replace(robot, postures={**robot.postures, "of the robot alone": posture})
+    given = posture if near == "of its own" else near
+    problem = dataclasses.replace(nailing, robot=robot, near_contact=given)
     assert_same(back(text := write_problem(problem)), problem)
     assert ('near_contact = "ready"' in text) is (near == "ready")
 

@@ -280,14 +280,14 @@ def test_contacts_without_time_have_no_gains_to_choose() -> None:
 @pytest.mark.parametrize("factor", [(1.0, 1.0), (2.0, 1.0), (0.0, 1.0), (1.0, np.inf), (1.0, 1e4)])
 def test_a_factor_leaves_a_choice(factor: tuple[float, float]) -> None:
     with pytest.raises(InputError, match="factor"):
-        GainFactor(joints=("wrist",), factor=factor)  # type: ignore[arg-type]
+        GainFactor(joints=("wrist",), factor=factor)
 
 
 @pytest.mark.parametrize("factor", [0.5, np.int64(2)])
 def test_one_number_as_a_factor_is_refused_with_the_function_that_takes_it(factor: object) -> None:
     """A file takes one, so a user tries it here, too."""
     with pytest.raises(InputError, match="for one number take scaled_gains"):
-        GainFactor(joints=("wrist",), factor=factor)
+        GainFactor(joints=("wrist",), factor=factor)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

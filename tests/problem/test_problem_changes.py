@@ -199,12 +199,16 @@ def test_the_hash_is_of_the_content(problem: ImpactProblem) -> None:
         ProblemFile.from_data(read_toml(write_toml(DATA)), Path("elsewhere")).build().hash,
     ]
     assert set(same) == {problem.hash} and problem.hash == problem_hash(problem)
+    near = problem.contact_posture
+    named = dataclasses.replace(problem.robot, postures={**problem.robot.postures, "near": near})
+    assert changed(near_contact=near) == changed(near_contact="near", robot=named)
     hammer = problem.robot.striker("hammer")
     moved = Striker(name="hammer", frame=hammer.frame, point=hammer.point + np.array([0.001, 0, 0]))
     law: dict[str, Any] = {"compression": lambda x, rate, k: k * x, "k": 1e4}
     other = [
         changed(target=FreeMass(mass=0.5 + 1e-15)),
         changed(scenarios=()),
+        changed(near_contact=near),
         changed(terms=(terms.TorqueLimit(fraction=0.8),)),
         changed(objectives=(objectives.Impulse(weight=2.0),)),
         changed(swing=Phase(duration=(0.4, 0.8), intervals=13)),

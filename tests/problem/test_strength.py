@@ -89,6 +89,8 @@ def test_a_posture_given_near_contact_goes_first() -> None:
     assert not np.array_equal(strongest_posture(given, 2), other), "further starts have others"
     with pytest.raises(InputError, match="near_contact"):
         replace(problem, near_contact=other[1:])
+    with pytest.raises(InputError, match="near_contact"):
+        replace(problem, near_contact=np.degrees(other))
 
 
 def test_further_starts_have_other_postures() -> None:

@@ -25,7 +25,7 @@ from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import FIXED, Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_edge, find_striker, find_toe
-from impactopt.files.draft.strong import FOLLOW, ITERATIONS, SECONDS, SWING, Strong, durations, strongest
+from impactopt.files.draft.strong import FOLLOW, SWING, TRIAL, Strong, durations, strongest
 from impactopt.files.draft.target_placement import STRIKE_DIRECTIONS, Arm, aims, ready
 from impactopt.files.problem_file.reading import ProblemFile
 from impactopt.files.problem_file.sections import comment_at
@@ -381,8 +381,7 @@ def _strike(data: dict[str, Any], folder: Path, *, start: StrikeSolution | None 
     """Strike of drafted data, from the plain initial guess or another strike."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a failed trial is no result
-        options = {"max_iterations": ITERATIONS}
-        return optimize_strike(_built(data, folder), start=start, options=options, time_limit=SECONDS)
+        return optimize_strike(_built(data, folder), start=start, options=TRIAL)
 
 
 def _kick(case: _Case) -> Draft:
@@ -436,7 +435,7 @@ def _hardest_planned(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a failed trial is no result
             with contextlib.suppress(InputError):
-                solution = solve(problem_of(k), options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
+                solution = solve(problem_of(k), options=TRIAL)
                 if solution.status.usable:
                     found.append((sum(solution.objectives.values()), k))
     return (max(found)[1], max(found)[0]) if found else None

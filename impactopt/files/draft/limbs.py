@@ -181,7 +181,7 @@ def unshared(model: pin.Model, legs: Sequence[Limb]) -> list[tuple[int, ...]]:
 
 
 def renumbered(limb: Limb, old: pin.Model, new: pin.Model) -> Limb:
-    """The same joints, by name, in a model that has more."""
+    """The same joints, by name, in another model that has them."""
 
     def at(joints: tuple[int, ...]) -> tuple[int, ...]:
         return tuple(int(new.getJointId(old.names[j])) for j in joints)

@@ -40,7 +40,8 @@ DURATION_FACTORS = (0.8, 3.0)  # shortest and longest duration over the time at 
 LEVEL = 1e-3  # [m] tolerance of heights, to which hit points are rounded
 AFTER = 0.6  # [s] in which a target that flies away may not meet the base
 AFTER_STEP = 0.03  # [m] of its travel between two tests
-ITERATIONS, SECONDS = 300, 30.0  # limits of a trial strike or plan: most need a sixth of that
+# Limit of a trial strike or plan: most need a third. A time limit would make drafts depend on the machine.
+TRIAL = {"max_iterations": 200}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,7 +78,7 @@ def strongest(
     for problem, impact in candidates:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
-            solved = optimize_strike(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
+            solved = optimize_strike(problem, options=TRIAL)
         if solved.status.usable:
             found.append(
                 Strong(

@@ -335,7 +335,7 @@ def _player(problem: ImpactProblem) -> str:
     numbers, before, target = dict(problem.law.parameters), "", problem.target
     if isinstance(target, Nail) and target.hardening:
         before = NAIL
-        # a law may have a parameter of the same name
+        # apart from the parameters of the law
         numbers |= {f"nail_{name}": target.parameters[name] for name in ("resistance", "hardening", "depth")}
     if isinstance(target, Board):
         before = BOARD

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -400,15 +401,19 @@ class Coordinates:
         return [[1.0, sr * t, cr * t], [0.0, cr, 0.0 - sr], [0.0, sr / cp, cr / cp]]
 
     # ------------------------------------------------------------ numeric
+    @cached_property
+    def _rpy_coordinates(self) -> RpyCoordinates:
+        return RpyCoordinates(self.tree.model)
+
     def from_pin(self, q: ArrayLike) -> NDArray[np.float64]:
         """These coordinates (nq,) of Pinocchio's q; angles of continuous joints in (-pi, pi]."""
         q = check_configuration(self.tree.model, q, "q (pinocchio)")
-        return q if self.base == "quaternion" else RpyCoordinates(self.tree.model).from_pin(q)
+        return q if self.base == "quaternion" else self._rpy_coordinates.from_pin(q)
 
     def to_pin(self, q: ArrayLike) -> NDArray[np.float64]:
         """Pinocchio's q, (..., model.nq), of one configuration (nq,) or of several (k, nq)."""
         q = check_array("q", q, (self.nq,) if np.ndim(q) < 2 else (None, self.nq))
-        return q if self.base == "quaternion" else RpyCoordinates(self.tree.model).to_pin(q)
+        return q if self.base == "quaternion" else self._rpy_coordinates.to_pin(q)
 
 
 def _quaternion_matrix(x: Scalar, y: Scalar, z: Scalar, w: Scalar) -> Matrix:

@@ -24,7 +24,8 @@ _CACHED_BODIES = ("world", "bodies")
 def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
     """`dataclasses.replace` with the cached properties that stay valid.
 
-    Robot, stance, start and `near_contact` have to be the same. The posture at contact is searched from the old one.
+    Robot, stance, start and `near_contact` have to be the same. The posture at contact is searched from the
+    old one.
     """
     # `dataclasses.replace` would lose the cached properties, bodies and coordinates among them.
     new = object.__new__(type(problem))

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.codegen.files import read_archive, read_plain
-from impactopt.errors import InputError
+from impactopt.errors import InputError, shortened
 from impactopt.files.toml import check_plain, text_with_control
 
 FORMAT = 2  # of solution.npz; increased by a change that an older reader would misread
@@ -119,6 +119,8 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     ------
     InputError : there is none, it is damaged, or of a newer impactopt.
     """
+    if not isinstance(directory, (str, os.PathLike)):
+        raise InputError(f"a result is given by the path of its directory, not {shortened(repr(directory))}")
     path = Path(directory)
     path = path if path.name == NUMBERS and not os.path.isdir(path) else path / NUMBERS
     fix = "solve again with `impactopt solve`"

@@ -160,6 +160,8 @@ def test_a_saved_result_is_a_solution_again(folder: SolvedFolder, solution: Solu
     assert again.sensitivity(price).impulse == pytest.approx(expected, rel=1e-6)
     with pytest.raises(InputError, match=r"there is no .*solution\.npz"):
         load_solution(tmp_path / "nothing")
+    with pytest.raises(InputError, match="path of its directory, not None"):
+        load_solution(None)  # type: ignore[arg-type]
 
 
 def test_a_solution_is_saved_from_python(hammered: Solution, tmp_path: Path) -> None:

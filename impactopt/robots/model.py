@@ -31,7 +31,7 @@ class JointAngles:
         self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
 
     def of(self, q: Array) -> Array:
-        """Angles (..., n) of configurations (..., nq); those of continuous joints in (-pi, pi]."""
+        """Angles (..., n) of configurations (..., nq); those of continuous joints in [-pi, pi]."""
         angles = q.take(self._place, axis=-1)
         for k in self.continuous:
             at = self._place[k]

@@ -261,7 +261,7 @@ class HessianMap:
         numbers = sp.csc_array((np.arange(pattern.size), template.indices, template.indptr), shape)
         across = numbers.T.tocsc().data.astype(np.int32)
         in_pattern = np.bincount(np.searchsorted(pattern, at), 0.5 * values, pattern.size).astype(float)
-        sizes = pattern.size, int(_starts(blocks)[-1])
+        sizes = pattern.size, int(_starts([b.hessian for b in blocks])[-1])
         sums = Runs.make(source, np.searchsorted(pattern, linear_index), length, factor, sizes)
         return cls(len(blocks), template, pattern, across, in_pattern, sums)
 
@@ -274,7 +274,8 @@ class HessianMap:
         # indices ascend, so those of a run are all there if its last one is where it has to be
         if (np.append(self.pattern, -1)[end] != linear_index + length - 1).any():
             return None
-        sums = self.sums.with_more(source, begin, length, factor, int(_starts(blocks)[-1]))
+        entries = int(_starts([b.hessian for b in blocks])[-1])
+        sums = self.sums.with_more(source, begin, length, factor, entries)
         return replace(self, blocks=len(blocks), sums=sums)
 
     @staticmethod
@@ -284,7 +285,8 @@ class HessianMap:
         """Sources, linear indices, lengths and factors of the runs of the blocks from number ``since`` on."""
         parts, n, continues = [], lift.shape[1], _continues(lift)
         z = sum(b.count * b.n_in for b in blocks[:since])
-        for b, start in zip(blocks[since:], _starts(blocks)[since:], strict=False):
+        starts = _starts([b.hessian for b in blocks])
+        for b, start in zip(blocks[since:], starts[since:], strict=False):
             rows, columns = b.hess_pattern
             instance = np.arange(b.count)[:, None] * b.n_in
             # (instances, nonzeros of one): row and column among the inputs of all blocks
@@ -311,14 +313,14 @@ class HessianMap:
         return _with_values(self.template, values)
 
 
-def _starts(blocks: Sequence[Block]) -> Index:
-    """Offsets of the nonzeros of each block's Hessian among those of all blocks, and their number."""
-    return np.cumsum([0, *[b.hessian.size for b in blocks]])
+def _starts(functions: Sequence[BatchedFunction]) -> Index:
+    """Offset of each function's nonzeros among those of all, and their number."""
+    return np.cumsum([0, *[f.size for f in functions]])
 
 
 def _shared(functions: Sequence[BatchedFunction]) -> tuple[Array, Index]:
     """One array that all these functions write to from now on, and the offset of each in it."""
-    starts = np.cumsum([0, *[f.size for f in functions]])
+    starts = _starts(functions)
     entries = np.zeros(int(starts[-1]))
     for f, start in zip(functions, starts, strict=False):
         f.write_to(entries[start : start + f.size])

@@ -25,13 +25,14 @@ from impactopt.simulation.result import FACE
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_refinement import finest
-from impactopt.transcription.mesh import GEAR
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, plan_loads, strike_loads
 from impactopt.transcription.transcription import Transcription
 
 # Tolerances beyond a limit. In replays of a plan that keeps its gear limits, loads stay within the first one
-# (of the limit). The others are what a plan with constraints exceeds between its nodes.
+# (of the limit). The second is rounding: a plan without constraints keeps its limit or gets them. The others
+# are what a plan with constraints exceeds between its nodes.
 REPLAY_GEAR_TOLERANCE = 0.1
+_GEAR = 1e-3
 REFERENCE_TOLERANCE = 1e-3  # [rad]
 SLIDE_TOLERANCE = 0.03  # of the limit
 FAR = 0.15  # [m] across the target's face: a longer slide gets a warning
@@ -43,10 +44,9 @@ _AT_BOUND = 1e-3  # of a duration's bound: nearer ones are at it
 _COSTLY = 0.1
 
 
-def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: float = GEAR) -> str:
-    """Message with the gear whose load is farthest beyond its limit; "" if none is beyond the tolerance.
-
-    more : tolerance, of the limit. The default of 3 % is what constraints leave between the program's nodes.
+def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: float) -> str:
+    """Message with the gear whose load is farthest beyond its limit; "" if none is beyond by `more`, a fraction
+    of the limit.
     """
     most = problem.gear_load.most(problem.robot)
     worst, message = 1.0 + more, ""
@@ -294,7 +294,7 @@ class LazyTerms(Generic[Program]):
                 continue
             message = ""
             if isinstance(term, GearLoad):
-                message = gears_beyond(problem, self._gears(outcome))
+                message = gears_beyond(problem, self._gears(outcome), more=_GEAR)
             elif isinstance(term, Slide) and isinstance(planned, Plan):
                 message = slides_beyond(term, planned)
             elif isinstance(term, ReferenceRange) and isinstance(planned, Plan):

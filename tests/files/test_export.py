@@ -61,6 +61,7 @@ from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
 from impactopt.files.record import Record
 from impactopt.files.replay import Planned
+from impactopt.planning.lazy_constraints import lazy_terms_of, with_lazy_constraints
 from impactopt.simulation import Simulation, scene_of, simulate_mujoco
 from impactopt.simulation.mujoco_world import MujocoOptions, build_world
 
@@ -85,9 +86,10 @@ def planned(arm: Solution) -> Planned:
 
 @pytest.fixture(scope="module")
 def filed(planned: Planned) -> Record:
-    """The plan's record as if its problem were that of a file."""
+    """The plan's record as if its problem were that of a file, with the same lazy constraints."""
     path = problem_file("arm_planar")
-    own = planned.record.summary["problem"] | load_problem(path).describe()
+    lazy = lazy_terms_of(planned.problem)
+    own = planned.record.summary["problem"] | with_lazy_constraints(load_problem(path), lazy).describe()
     return dataclasses.replace(
         planned.record,
         problem=path.read_text(encoding="utf-8"),

@@ -43,7 +43,7 @@ def test_a_problem_and_its_solution_are_pickled(arm: ImpactProblem, strike: Stri
     again = pickle.loads(pickle.dumps(strike))
     assert again.impulse == strike.impulse
     assert np.array_equal(again.problem.coordinates.start, arm.coordinates.start)
-    assert again.problem.hash == arm.hash
+    assert again.problem.hash == strike.problem.hash
 
 
 def test_a_pickle_of_another_version_is_refused_with_both_versions(

@@ -371,7 +371,7 @@ def with_limits_kept(
     collision : of the plan, on a finer mesh if there is one.
     """
     with contextlib.suppress(InputError):  # legs out of reach: completing the motion reports it
-        if short := shortfalls(plan.sole_margins(collision)):
+        if short := shortfalls(plan.sole_margins(collision, coarse=True)):
             message = (
                 f"A sole keeps less than half of a margin between nodes: {'; '.join(short[:MAX_NAMED])}."
             )
@@ -392,7 +392,7 @@ def lost_in_contact(plan: Plan, collision: PlannedCollision) -> bool:
     """True if a plan loses limits of soles or of the slide between collocation points; collision: as of
     `with_limits_kept`.
     """
-    return bool(shortfalls(plan.sole_margins(collision), "collision") or _slide_beyond(plan))
+    return bool(shortfalls(plan.sole_margins(collision, coarse=True), "collision") or _slide_beyond(plan))
 
 
 def _slide_beyond(plan: Plan) -> str:
@@ -403,7 +403,7 @@ def _slide_beyond(plan: Plan) -> str:
 def _joints_beyond(plan: Plan, robot: Robot) -> str:
     """Message with the joint that is farthest beyond the robot's limit of velocity or torque; "" if none."""
     worst, message = 1 + VIOLATED, ""
-    for t in (plan.reference, *([plan.missed_reference] if plan.abort is not None else [])):
+    for t in (plan.coarse_reference, *([plan.coarse_missed_reference] if plan.abort is not None else [])):
         for what, used in (
             ("velocity", t.v[:, -robot.n :] / robot.velocity_limit),
             ("torque", t.torque / robot.torque_limit),

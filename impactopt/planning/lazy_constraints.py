@@ -45,8 +45,8 @@ _COSTLY = 0.1
 
 
 def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: float) -> str:
-    """Message with the gear whose load is farthest beyond its limit; "" if none is beyond by `more`, a fraction
-    of the limit.
+    """Message with the gear whose load is farthest beyond its limit; "" if none is beyond by `more`, a
+    fraction of the limit.
     """
     most = problem.gear_load.most(problem.robot)
     worst, message = 1.0 + more, ""

@@ -61,7 +61,7 @@ NO_MORE = MoreNodes()
 def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     """The ``known`` additional nodes, and the middle between any two nodes where the plan violates limits.
 
-    The plan is checked every millisecond, which is the step of its reference. A violation between nodes is
+    The plan is checked at the instants of its coarse reference. A violation between nodes is
 
     * a sole that loses more than half of its margin of the centre of pressure, or of the least normal force,
       or uses 10 % more friction than allowed;
@@ -71,10 +71,10 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     """
     blow, found = plan.problem.blow, dict[tuple[int, int], set[float]]()
     for piece in plan.pieces():
-        found[piece.phase, piece.number] = set(_middles_violated(plan, plan.reference, piece))
+        found[piece.phase, piece.number] = set(_middles_violated(plan, plan.coarse_reference, piece))
     if plan.abort is not None:  # the abort motion has the follow-through's nodes
         for piece in plan.pieces(missed=True)[len(plan.before) + 1 :]:
-            middles = _middles_violated(plan, plan.missed_reference, piece)
+            middles = _middles_violated(plan, plan.coarse_missed_reference, piece)
             # one mesh for both motions to rest, so nodes that either needs
             found[piece.phase, piece.number] |= set(middles)
     stands = [

@@ -35,10 +35,11 @@ from impactopt.robots.loads import (
 from impactopt.robots.model import mass_matrix
 from impactopt.robots.robot import Robot
 
-# [s] Steps of the coarse references, from which loads and clearances are taken, and of all references in
+# [s] Steps of the coarse references, with which a plan is checked between its nodes, and of all references in
 # contact, at most. Loads change no faster than the nodes are apart, and inverse dynamics of every millisecond
 # is slow.
 COARSE_STEP, CONTACT_STEP = 5e-3, 1e-3
+_BETWEEN_NODES = 3  # steps of a coarse reference between two nodes, at least
 MOMENT_COST = 10.0  # [1/m] weight of a wrench correction's moments relative to its forces
 
 
@@ -440,15 +441,21 @@ class Plan:
 
     @cached_property
     def coarse_reference(self) -> Trajectory:
-        """The servo's reference every `COARSE_STEP`, in contact every millisecond; InputError as of
-        `reference`.
+        """The servo's reference every `COARSE_STEP`, more often where nodes are nearer, in contact every
+        millisecond; InputError as of `reference`.
         """
-        return self.trajectory(step=COARSE_STEP, hold=COARSE_STEP)
+        return self.trajectory(step=self._coarse_step, hold=self._coarse_step)
 
     @cached_property
     def coarse_missed_reference(self) -> Trajectory:
         """`missed_reference` with the steps of `coarse_reference`."""
-        return self.trajectory(step=COARSE_STEP, hold=COARSE_STEP, missed=True, known=self.coarse_reference)
+        step = self._coarse_step
+        return self.trajectory(step=step, hold=step, missed=True, known=self.coarse_reference)
+
+    @property
+    def _coarse_step(self) -> float:
+        least = min(piece.spline.duration * float(np.diff(piece.nodes).min()) for piece in self.pieces())
+        return min(COARSE_STEP, least / _BETWEEN_NODES)
 
     @cached_property
     def missed_reference(self) -> Trajectory:
@@ -798,21 +805,23 @@ class Plan:
             out[own] = margin_of(support_polygon(self.problem.robot, c), reference.ground[own])
         return out[chosen]
 
-    def sole_margins(self, collision: PlannedCollision | None = None) -> dict[str, Any]:
+    def sole_margins(
+        self, collision: PlannedCollision | None = None, *, coarse: bool = False
+    ) -> dict[str, Any]:
         """Planned margins of each sole and the required ones, as in ``summary.json``; empty without soles.
 
         ``sole_cop_margin_mm`` and ``sole_force_N``, by sole and phase: the smallest distance of its centre of
         pressure from its own edges (:func:`impactopt.robots.loads.cop_margin`) and its smallest normal force.
-        They are taken every millisecond of swing and follow-through, at the known instants of the collision,
-        and after a missed target. ``sole_cop_margin_asked_mm``, by phase, and ``sole_force_asked_N`` are the
-        problem's requirements.
+        They are taken every millisecond of swing and follow-through (``coarse``: at the coarse references'
+        instants), at the known instants of the collision, and after a missed target.
+        ``sole_cop_margin_asked_mm``, by phase, and ``sole_force_asked_N`` are the problem's requirements.
 
         collision : as of :meth:`margins`.
         """
         p, cone = self.problem, self.problem.term(ContactWrenchCone)
         if not p.soles:
             return {}
-        ref = self.reference
+        ref = self.coarse_reference if coarse else self.reference
         hit = self.collision if collision is None else collision
         of_hit = self._wrench_of_all(p.blow, hit.sole_wrench) if p.stances else hit.sole_wrench
         # of each phase: wrenches (k, 6 a sole), and indices of stance phases (k,), or (0,) if there is one
@@ -823,7 +832,7 @@ class Plan:
             "follow": (ref.sole_wrench[ref.phase == 2], ref.stance[ref.phase[: len(ref.stance)] == 2]),
         }
         if self.abort is not None:
-            missed = self.missed_reference
+            missed = self.coarse_missed_reference if coarse else self.missed_reference
             after = missed.phase > 0
             parts["missed"] = missed.sole_wrench[after], missed.stance[after[: len(missed.stance)]]
         labels = np.repeat(list(parts), [len(part) for part, _ in parts.values()])

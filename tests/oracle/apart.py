@@ -49,12 +49,19 @@ def apart_pieces(
 
 
 class _Hulls:
-    """Vertices (m, most, 3) of m hulls, and which of them are there."""
+    """Vertices (m, most, 3) of m hulls, and which of them are not there."""
 
-    def __init__(self, points: Array, which: NDArray[np.int64]) -> None:
+    def __init__(self, vertices: Array, missing: NDArray[np.bool_]) -> None:
+        self.vertices, self.missing = vertices, missing
+
+    @classmethod
+    def of(cls, points: Array, which: NDArray[np.int64]) -> _Hulls:
         most = int(which[:, 1].max())
-        self.vertices = points[which[:, :1] + np.minimum(np.arange(most), which[:, 1:] - 1)]
-        self.missing = np.arange(most) >= which[:, 1:]
+        vertices = points[which[:, :1] + np.minimum(np.arange(most), which[:, 1:] - 1)]
+        return cls(vertices, np.arange(most) >= which[:, 1:])
+
+    def __getitem__(self, which: NDArray[np.bool_]) -> _Hulls:
+        return _Hulls(self.vertices[which], self.missing[which])
 
     def support(self, u: Array) -> tuple[Array, Array, Array]:
         """Rounded supports (m,), their gradients (m, 3) and second derivatives (m, 3, 3) in directions."""
@@ -119,8 +126,8 @@ def _piece(
     flat = [(int(row["joint"]), int(row["other"]), row) for row in at]
     numbers = [shapes.index[joint, other, int(row["number"])] for joint, other, row in flat]
     one, two = (
-        _Hulls(shapes.points, shapes.hulls[numbers, :2]),
-        _Hulls(shapes.points, shapes.hulls[numbers, 2:]),
+        _Hulls.of(shapes.points, shapes.hulls[numbers, :2]),
+        _Hulls.of(shapes.points, shapes.hulls[numbers, 2:]),
     )
     reach = np.array([row["least_distance"] for _, _, row in flat], dtype=float) + shapes.radius[numbers]
     ways = np.array([row["vector"] for _, _, row in flat], dtype=float)
@@ -128,6 +135,8 @@ def _piece(
     joints = sorted({joint for joint, _, _ in flat} | {other for _, other, _ in flat if other >= 0})
     index = {joint: k for k, joint in enumerate(joints)}
     turns, shifts, moves = list[Array](), list[Array](), list[bool]()
+    # of the first variables: the second body's view of the first (`_distances`), distances and directions
+    kept = list[Array]()
     first, second = list[int](), list[int]()
     for joint, other, _ in flat:
         first.append(index[joint])
@@ -148,7 +157,14 @@ def _piece(
         shift = np.array([*(at.translation for at in placed), *world])
         back = turn[second].transpose(0, 2, 1)
         apart = np.einsum("kij,kj->ki", back, shift[first] - shift[second])
-        found, ways[...] = _distances(one, two, back @ turn[first], apart, ways)
+        turned = back @ turn[first]
+        if not kept:
+            kept.extend((turned, apart, *_distances(one, two, turned, apart, ways)))
+        # one joint moves some pairs: a difference computes the others once
+        new = (turned != kept[0]).any(axis=(1, 2)) | (apart != kept[1]).any(axis=1)
+        found, start = kept[2].copy(), kept[3]
+        if new.any():
+            found[new], _ = _distances(one[new], two[new], turned[new], apart[new], start[new])
         return found - reach
 
     rows = [

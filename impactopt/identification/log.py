@@ -89,7 +89,8 @@ def read_log(
 
     Columns are `time_s`, `force_N`, and `hand_speed_m_s`. Instead of the last there may be all joint
     positions of a robot on a fixed base, `<joint>_rad` (`<joint>_m` of a sliding one), from which `robot`,
-    `striker` and `normal` give the motion of the hand. Other columns are ignored.
+    `striker` and `normal` give the motion of the hand; with a robot the speed is not read. Other columns are
+    ignored.
 
     Raises
     ------
@@ -100,12 +101,17 @@ def read_log(
     name = shortened(str(file))
     columns = _npz(file, name) if file.suffix == ".npz" else _csv(file, name)
     time, force = (_column(columns, needed, name) for needed in (TIME, FORCE))
-    if SPEED in columns:
-        return ImpactLog(time=time, force=force, speed=_column(columns, SPEED, name), name=name)
     if robot is None:
+        if SPEED in columns:
+            return ImpactLog(time=time, force=force, speed=_column(columns, SPEED, name), name=name)
         raise InputError(
             f"{name}: no column {SPEED}{did_you_mean(SPEED, columns)}; give it, or joint positions and the "
             f"robot they are of. It has {_listed(columns)}"
+        )
+    if SPEED in columns and not any(joint in columns for joint in _joint_columns(robot)):
+        raise InputError(
+            f"{name} has {SPEED}, and no joint positions: leave robot (--problem) out, or give the columns "
+            f"{', '.join(_joint_columns(robot))}"
         )
     travel, mass = _hand(columns, robot, striker, normal, name)
     return ImpactLog(time=time, force=force, travel=travel, model_mass=mass, name=name)
@@ -206,10 +212,16 @@ def _hand(
     return travel, mass
 
 
+def _joint_columns(robot: Robot) -> list[str]:
+    """Columns of all joints' positions."""
+    units = ("m" if sliding else "rad" for sliding in robot.prismatic)
+    return [f"{joint}_{unit}" for joint, unit in zip(robot.joint_names, units, strict=True)]
+
+
 def _joint(columns: Columns, robot: Robot, k: int, name: str) -> Array:
     """Positions (k,) [rad] or [m] of a joint, by its number."""
     joint = robot.joint_names[k]
-    values = _column(columns, f"{joint}_{'m' if robot.prismatic[k] else 'rad'}", name)
+    values = _column(columns, _joint_columns(robot)[k], name)
     low, high = robot.lower[k], robot.upper[k]
     values = check_array(f"{name}: {joint}", values, (np.size(_column(columns, TIME, name)),), most=MOST)
     far = np.maximum(values - high, low - values).max(initial=0.0)

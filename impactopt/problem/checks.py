@@ -35,9 +35,10 @@ from impactopt.errors import (
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import margin, shrink, support_polygon
-from impactopt.problem.objectives import STYLES, PeakForce, Penetration, TargetEnergy
+from impactopt.problem.objectives import OBJECTIVES, STYLES, PeakForce, Penetration, TargetEnergy
 from impactopt.problem.scenario import SecondStriker
 from impactopt.problem.terms import (
+    TERMS,
     ContactWrenchCone,
     Grip,
     HitCone,
@@ -224,11 +225,10 @@ def check_second(problem: Any) -> None:
         if isinstance(thing, (HitCone, HitRegion, Slide, PeakForce, Penetration)) or (
             getattr(thing, "first_instant", False)
         ):
-            name, section = type(thing).__name__, "objectives" if thing in p.objectives else "terms"
-            raise InputError(
-                f"{name}, in a file [{section}.{snake_case(name)}], is for one striker: leave it out, or the "
-                "second one"
-            )
+            kind, section = type(thing), "objectives" if thing in p.objectives else "terms"
+            own = kind not in (*TERMS, *OBJECTIVES)  # a user's class, which files do not have
+            in_file = "" if own else f", in a file [{section}.{snake_case(kind.__name__)}],"
+            raise InputError(f"{kind.__name__}{in_file} is for one striker: leave it out, or the second one")
 
 
 def check_strikers(problem: Any) -> None:

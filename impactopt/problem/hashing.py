@@ -29,7 +29,7 @@ def problem_hash(problem: Any) -> str:
     data = {
         f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name not in _NOT_HASHED
     }
-    second, near = data.pop("second"), data.pop("near_contact")
+    second = data.pop("second")
     # features that a problem does not use are left out, so that problems without them keep their hashes
     for name in ("stances", "friction"):
         if not data[name]:
@@ -43,8 +43,8 @@ def problem_hash(problem: Any) -> str:
     if gains := data.pop("gains"):
         each = zip(problem.gain_joints, gains, strict=True)
         data["gains"] = sorted((joints, gain.factor) for joints, gain in each)
-    if near is not None:
-        data["near_contact"] = problem.robot.given_posture(near, name="near_contact")
+    if data.pop("near_contact") is not None:
+        data["near_contact"] = problem.posture_near_contact
     if second is not None:
         other = problem.robot.striker(second.striker)
         data["second"] = (other.frame, other.point, second.point)

@@ -270,8 +270,7 @@ class ImpactProblem:
         posture = self.start_posture
         if not isinstance(self.start, str):  # a copy, which does not follow the caller's array
             object.__setattr__(self, "start", posture.copy())
-        if self.near_contact is not None:
-            near = self.robot.given_posture(self.near_contact, name="near_contact")
+        if (near := self.posture_near_contact) is not None:
             self.robot.check_limits(near, name="near_contact")
             if not isinstance(self.near_contact, str):
                 object.__setattr__(self, "near_contact", near)
@@ -452,10 +451,14 @@ class ImpactProblem:
         ------
         InputError : the point is out of reach.
         """
-        if self.near_contact is None:
-            return self.contact_posture_near(self.change_posture(self.blow - 1))
-        near = self.robot.given_posture(self.near_contact, name="near_contact")
-        return self.contact_posture_near(near)
+        near = self.posture_near_contact
+        return self.contact_posture_near(self.change_posture(self.blow - 1) if near is None else near)
+
+    @property
+    def posture_near_contact(self) -> Array | None:
+        """Posture (nq,) of `near_contact`."""
+        given = self.near_contact
+        return None if given is None else self.robot.given_posture(given, name="near_contact")
 
     def contact_posture_near(self, guess: Array) -> Array:
         """Posture (nq,) with the strikers at their points and the soles in place, by inverse kinematics from

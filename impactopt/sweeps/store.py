@@ -234,6 +234,11 @@ class Store:
                     f"{self.path} holds rows of a sweep, but {place.name}, which identifies it, is missing; "
                     "put it back, or give another directory"
                 ) from None
+            own = (self.table, self.solved, self.path / "cases", self.path / "figure.png")
+            if other := next((path for path in own if path.exists()), None):
+                raise InputError(
+                    f"{other} is of no sweep, and would be replaced; give another --out"
+                ) from None
             write_file(self.path / "sweep.toml", lambda file: file.write(sweep.text.encode()))
             write_file(place, lambda file: file.write(json.dumps(now, indent=1).encode()))
             return

@@ -303,6 +303,12 @@ def test_joint_positions_are_as_good_as_a_speed(tmp_path: Path) -> None:
     for name, value in {**TRUE["spring damper"][1], "effective_mass": MASS}.items():
         assert found.best.estimates[name].value == pytest.approx(value, rel=0.05), name
     assert any("robot's model has an effective mass" in caution for caution in found.cautions)
+    np.savez(path, time_s=t, force_N=force, hand_speed_m_s=0 * t, **joints)
+    again = read_log(path, robot=arm, striker=problem.striker, normal=n)
+    assert again.speed is None and np.array_equal(again.travel, log.travel)
+    np.savez(path, time_s=t, force_N=force, hand_speed_m_s=0 * t)
+    with pytest.raises(InputError, match=r"no joint positions: leave robot \(--problem\) out"):
+        read_log(path, robot=arm, striker=problem.striker, normal=n)
     np.savez(path, time_s=t, force_N=force, **{name: np.rad2deg(x) for name, x in joints.items()})
     with pytest.raises(InputError, match="degrees"):
         read_log(path, robot=arm, striker=problem.striker, normal=n)

@@ -17,6 +17,7 @@ from impactopt import (
     FreeMass,
     GearLoad,
     HitCone,
+    HitRegion,
     ImpactProblem,
     InputError,
     PeakForce,
@@ -275,6 +276,10 @@ def test_terms_that_are_off_are_allowed_with_two(problem: ImpactProblem) -> None
     assert off in replace(problem, terms=(*problem.terms, off)).terms
 
 
+class OfOne(HitRegion):
+    """A user's own term."""
+
+
 def test_what_two_cannot_do_is_refused(problem: ImpactProblem) -> None:
     second = problem.second
     assert second is not None
@@ -283,6 +288,7 @@ def test_what_two_cannot_do_is_refused(problem: ImpactProblem) -> None:
         ({"target": Board(mass=1.0, stiffness=1e4, breaking_force=100.0)}, "FreeMass or a RigidWall"),
         ({"terms": (*problem.terms, HitCone(angle=0.1))}, r"\[terms.hit_cone\], is for one striker"),
         ({"objectives": (PeakForce(weight=-1.0),)}, r"\[objectives.peak_force\], is for one striker"),
+        ({"terms": (*problem.terms, OfOne(radius=0.1))}, r"^OfOne is for one striker"),  # which no file has
         ({"second": SecondStriker(striker="right_hand", point=second.point)}, "limb of its own"),
         ({"second": SecondStriker(striker="left_hnd", point=second.point)}, "left_hand"),
         ({"second": SecondStriker(striker="left_hand", point=np.array([0.5, 3.0, 1.0]))}, "out of reach"),

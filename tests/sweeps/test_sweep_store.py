@@ -190,6 +190,18 @@ def test_the_same_sweep_goes_on_and_another_is_refused(tmp_path: Path) -> None:
     Store(sweep(), tmp_path).close()  # the lock is free after a refusal
 
 
+def test_files_that_a_sweep_would_replace_are_refused(tmp_path: Path) -> None:
+    """Others may be beside its own."""
+    (tmp_path / "notes.txt").write_text("mine")
+    own = tmp_path / "table.parquet"
+    own.write_text("mine")
+    with pytest.raises(InputError, match=r"table\.parquet is of no sweep, and would be replaced"):
+        Store(sweep(), tmp_path)
+    assert own.read_text() == "mine" and not (tmp_path / "sweep.json").exists()
+    own.unlink()
+    Store(sweep(), tmp_path).close()
+
+
 URDF = """<robot name="lever"><link name="base"/><link name="lever"><inertial><mass value="1"/>
 <origin xyz="0.2 0 0"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="hinge" type="revolute"><parent link="base"/><child link="lever"/><axis xyz="0 1 0"/>

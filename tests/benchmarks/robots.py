@@ -27,6 +27,7 @@ from impactopt.bodies.robot_bodies import striker_face
 from impactopt.errors import InputError
 from impactopt.files.draft.drafting import draft_problem
 from impactopt.files.draft.strong import durations, strike_problem
+from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import read_problem_file
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
@@ -103,7 +104,7 @@ def run(
     names : of `ROBOTS`, all by default.  targets : random targets whose best motion a bolted arm's is
     compared with; 0: none are.  motion : that is drafted; None: the usual one.  seed : of the targets.
     resume : do not repeat rows that `rows` has.
-    drafts : folder of the drafted files.
+    drafts : folder of the drafted files and the results.
 
     Raises
     ------
@@ -133,6 +134,11 @@ def run(
     return Report(name="robots", numbers=numbers, tables=(columns_table(title, COLUMNS, found),))
 
 
+def file_of(name: str, drafts: Path) -> Path:
+    """Drafted file of a robot; its result is in the directory of the same name."""
+    return drafts / f"{re.sub('[^a-z0-9]+', '_', name.lower())}.toml"
+
+
 def _true(row: Mapping[str, Any]) -> bool:
     """A plan that is solved, replayed within a per cent held and two free, and stands."""
     if row["status"] != "solved" or not row.get("stands"):
@@ -144,18 +150,19 @@ def _row(
     name: str, file: Path, drafts: Path, rng: np.random.Generator, targets: int, motion: str | None
 ) -> dict[str, Any]:
     out: dict[str, Any] = {"robot": name}
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         draft = draft_problem(file, folder=drafts, motion=motion)
-        place = drafts / f"{re.sub('[^a-z0-9]+', '_', name.lower())}.toml"
+        place = file_of(name, drafts)
         place.write_text(draft.text, encoding="utf-8")
-        out["draft_seconds"] = time.perf_counter() - began
+        out["draft_seconds"] = time.process_time() - began
         problem = read_problem_file(place).build()
     except InputError as error:
         return out | {"status": "refused", "reason": str(error)}
     out |= {"joints": problem.robot.n, "said": list(draft.said)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row says so
+        began = time.process_time()
         try:
             solution = solve(problem, time_limit=TIME_LIMIT)
         except InputError as error:
@@ -163,7 +170,7 @@ def _row(
     out |= {
         "status": solution.status.value,
         "iterations": solution.result.iterations,
-        "seconds": solution.solve_seconds,
+        "seconds": time.process_time() - began,
         "impulse_Ns": solution.impulse,
         "reason": "" if solution.status.usable else solution.result.message,
     }
@@ -172,11 +179,15 @@ def _row(
         own = solution.impulse if solution.status.usable else 0.0
         best = max(motions, default=None)
         out |= {"motions": len(motions), "best_Ns": best, "share": own / best if best else None}
-    return out | (_replayed(solution) if solution.status.usable else {})
+    return out | (_replayed(solution, place) if solution.status.usable else {})
 
 
-def _replayed(solution: Solution) -> dict[str, Any]:
+def _replayed(solution: Solution, file: Path) -> dict[str, Any]:
+    """Numbers of both replays; the result is saved beside the draft."""
     held, free = (solution.validate(engine=engine) for engine in ("pinocchio", "mujoco"))
+    text = file.read_text(encoding="utf-8")
+    record = record_of(solution, simulation=held, replay=free, problem=text, problem_path=file)
+    save_record(record, file.with_suffix(""))
     return {
         "held_pct": 100 * (held.impulse / solution.impulse - 1),
         "free_pct": 100 * (free.impulse / solution.impulse - 1),

@@ -427,8 +427,8 @@ def _hardest_planned(
 
     A solved strike may have no motion, as links may be beyond the target's plane just before it. A motion is
     hardly ever harder than its strike, so the search ends at a strike that is weaker than the best motion.
-    Motions are solved at their nodes first, in a tenth of the time. The hardest one is then refined between
-    them, which may fail or cost impulse, until the hardest one is refined.
+    Motions are solved at their nodes first, which is quicker. The hardest one is then refined between them,
+    which may fail or cost impulse; the search ends when the hardest one is a refined one.
     """
     found, refined, k = dict[int, Solution](), set[int](), 0
 
@@ -442,11 +442,8 @@ def _hardest_planned(
 
     while found or k < len(strong):
         best = max(found, key=lambda k: _worth(found[k]), default=None)
-        if best is not None and (
-            len(found) == MAX_MOTIONS
-            or k == len(strong)
-            or strong[k].objective < WORTH_A_PLAN * _worth(found[best])
-        ):
+        enough = len(found) == MAX_MOTIONS or k == len(strong)
+        if best is not None and (enough or strong[k].objective < WORTH_A_PLAN * _worth(found[best])):
             if best in refined:
                 return best, _worth(found[best])
             refined.add(best)

@@ -164,8 +164,8 @@ class SelfCollision(Term):
     """Links of the robot have clearance, except where a joint connects them or they touch at the start
     (neighbours: start within 2 mm).
 
-    It is required from start to rest, after a miss too. Other links that are nearer than the margin at
-    the start may stay so near.
+    It is required from start to rest, after a miss too. Of links that start nearer than four times the
+    margin it is a quarter of their distance there.
     """
 
     name: ClassVar[str] = "self-collision"

@@ -10,18 +10,14 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, PlainValidator
 from pydantic.fields import FieldInfo
 
-from impactopt.errors import FARTHEST, MANY, MOST
+from impactopt.errors import MOST
 from impactopt.files.named_problems import problem_file, problem_summary
 from impactopt.files.problem_file.reading import read_problem_file
 from impactopt.files.problem_file.sections import File, TermSections, about_section, comment_at, defaults_of
 from impactopt.files.sections.collision import LAWS, TARGETS, with_kinds
 from impactopt.files.sections.diagnostics import range_of, section_at, section_in
-from impactopt.files.sections.reading import LONGEST_KEY
 from impactopt.files.sections.values import Section
-from impactopt.files.toml import DEEPEST, LONGEST_TEXT, Place, plain_value, write_toml
-from impactopt.problem.checks import LONGEST_CONTACT, MOST_ELEMENTS
-from impactopt.problem.phases import FINEST, LONGEST, SHORTEST, STEEPEST
-from impactopt.robots.checks import HEAVIEST
+from impactopt.files.toml import Place, plain_value, write_toml
 
 
 def problem_template(name: str) -> str:
@@ -105,48 +101,25 @@ impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit ma
 In Python `impactopt.load_problem("my.toml")` reads a file, and `impactopt.write_problem(problem)` gives the
 text of one without defaults, unless the problem has functions or models made in Python.
 
-## Limits
-
-Larger values are refused before work starts:
-
-{limits}
-
 This page is made by `impactopt new --reference`.
 """
-# quantity and its largest value, or range
-_LIMITS = (
-    ("a file", f"{LONGEST_TEXT / 2**20:g} MiB"),
-    ("nesting of tables and lists", f"{DEEPEST} deep"),
-    ("a key of `--set`", f"{LONGEST_KEY} characters"),
-    ("any number", f"{MOST:g}"),
-    ("parameters of law and target, where not 0", f"at least {1 / MOST:g}"),
-    ("a position or a length [m]", f"{FARTHEST:g}"),
-    ("a mass [kg] or an inertia [kg m2] of the robot", f"{HEAVIEST:g}"),
-    ("a phase's duration [s]", f"{SHORTEST:g} to {LONGEST:g}"),
-    ("a phase's `intervals`", f"{FINEST}"),
-    ("a phase's `grading`", f"1 to {STEEPEST:g}"),
-    ("`[collision] duration_s` [s]", f"{LONGEST_CONTACT:g}"),
-    ("`[collision] elements`", f"{MOST_ELEMENTS} a phase"),
-    ("`[[scenarios]]`, and `[[obstacles]]`", f"{MANY} each"),
-)
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
 
 def reference() -> str:
     """The page, in Markdown."""
-    limits = "\n".join(f"* {what}: {most}" for what, most in _LIMITS)
-    parts = [_INTRODUCTION.replace("{limits}", limits)]
+    parts, listed = [_INTRODUCTION], dict[str, list[str]]()
     several: dict[str, Mapping[str, type[Section]]] = {"target": TARGETS, "contact": LAWS}
     for name, info in File.model_fields.items():
         kinds = several.get(name, {})
         for kind, section in kinds.items():
             (choice,) = (i.alias or n for n, i in section.model_fields.items() if n == section.choice)
             note = ". The default" if kind == section.model_fields[section.choice].default else ""
-            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, note))
+            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, listed, note))
         below = _sections(name, info)
         if kinds:
             next(below)  # the section itself, whose keys are all listed by kind
-        parts += [_part(header, section) for header, section in below]
+        parts += [_part(header, section, listed) for header, section in below]
     return "\n".join(parts)
 
 
@@ -161,9 +134,18 @@ def _sections(place: str, info: FieldInfo) -> Iterator[tuple[str, type[BaseModel
         yield from _sections(f"{place}.{name}", inner)
 
 
-def _part(header: str, section: type[BaseModel], note: str = "") -> str:
-    """Markdown of a section and its keys."""
+def _part(header: str, section: type[BaseModel], listed: dict[str, list[str]], note: str = "") -> str:
+    """Markdown of a section and its keys.
+
+    listed : lines of the keys of the sections before, by header: several alike are named only.
+    """
     lines, keys = [f"## `{header}`", "", f"{about_section(section)}{note}."], list(_keys(section))
+    for other, known in listed.items():
+        if len(alike := [key for key in keys if key in known]) >= 3:
+            names = ", ".join(key.split()[1] for key in alike)
+            keys = [f"- {names}: as in `{other}`", *(key for key in keys if key not in alike)]
+            break
+    listed[header] = keys
     return "\n".join([*lines, *(["", *keys] if keys else []), ""])
 
 

@@ -140,6 +140,9 @@ def test_a_record_that_is_not_there(tmp_path: Path) -> None:
     for place in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(InputError, match=r"there is no .*solution\.npz"):
             load_record(place)
+    (tmp_path / "bad.npz").touch()
+    with pytest.raises(InputError, match=r"bad\.npz is a file; give the directory of a result"):
+        load_record(tmp_path / "bad.npz")
 
 
 def test_a_record_of_nearly_that_name_is_suggested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,7 +143,9 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     except InputError:
         raise
     except NotADirectoryError as error:
-        raise InputError(f"{path.parent} is a file; give the directory of a result, or its {NUMBERS}") from error
+        raise InputError(
+            f"{path.parent} is a file; give the directory of a result, or its {NUMBERS}"
+        ) from error
     except FileNotFoundError as error:
         near = near_result(path.parent)
         raise InputError(f"there is no {path}{near}; `impactopt solve NAME` writes results/NAME") from error

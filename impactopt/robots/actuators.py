@@ -51,9 +51,7 @@ class Actuator(Described):
         "angle at which this spring is relaxed", "rad", least=-FARTHEST, most=FARTHEST
     )
     continuous_torque: float | None = _optional("the gear's continuous torque", "N m", **_POSITIVE)
-    peak_torque: float | None = _optional(
-        "the gear's repeated peak torque, as at each start and stop", "N m", **_POSITIVE
-    )
+    peak_torque: float | None = _optional("the gear's repeated peak torque", "N m", **_POSITIVE)
     momentary_torque: float | None = _optional(
         "the gear's momentary peak torque, as in an impact", "N m", **_POSITIVE
     )

@@ -131,11 +131,11 @@ class StanceSection(Section):
 
 
 class StancePhaseSection(Section):
-    """A stance phase: an interval in which the same soles stand."""
+    """A stance phase, in which the same soles stand."""
 
     soles: list[str] = required("names of the soles that stand")
     duration: Duration = optional(
-        "duration [s]; left out of the phase with the impact, which has those of [swing] and [follow]",
+        "duration [s]; the phase with the impact has those of [swing] and [follow]",
         "duration_s",
     )
     intervals: int = optional("intervals of the spline, at least 6, by default 12")

@@ -30,7 +30,7 @@ class Gaze(Term):
     frame: str = field(metadata=about("name of the robot's frame"))
     axis: Vector = field(metadata=about("direction of view, in the frame", direction=True))
     angle: float = described(0.5, "largest angle of the hit point to the axis", unit="rad", above=0)
-    since: float = described(0.5, "share of the swing after which it holds", least=0)
+    since: float = described(0.5, "share of the swing before it holds", least=0)
 
     def __post_init__(self) -> None:
         self.check_angle()

@@ -118,6 +118,8 @@ def test_results_that_die_with_their_workers_are_computed_again(
         return future
 
     monkeypatch.setattr(distributed.as_completed, "__next__", then_killed)
+    # Dask's own number: with 1 a unit that begins anew on the second worker before its end is given up
+    monkeypatch.setattr(client.cluster.scheduler, "allowed_failures", 3)
     monkeypatch.setattr("impactopt.sweeps.cluster.evaluate", harmless)
     units = [Unit(index=k, first=k, count=1, columns={}) for k in range(3)]
     found = {unit.index: result.peak_mb for unit, result in on_cluster("", units, client, print)}  # type: ignore[arg-type]

@@ -66,6 +66,8 @@ def gallery(drafts: Path) -> Image.Image:
     """Each robot that has a plan, at contact."""
     names = {file_of(name, drafts).with_suffix(""): name for name in ROBOTS}
     found = {place: load_planned(place).record for place in names if place.is_dir()}
+    if not found:
+        raise SystemExit(f"{drafts} holds no result of `impactopt solve` or `make robots`")
     times = {place: (float(r.arrays["reference_contact_start"]) + 1e-3,) for place, r in found.items()}
     texts = [f"{names[place]}: {r.summary['impulse_Ns']:.3g} N s" for place, r in found.items()]
     drawn = _drawn(times, SMALL, 3.3, 0.0)

@@ -235,11 +235,14 @@ class Store:
                     "put it back, or give another directory"
                 ) from None
             own = (self.table, self.solved, self.path / "cases", self.path / "figure.png")
-            if other := next((path for path in own if path.exists()), None):
+            other, toml = next((path for path in own if path.exists()), None), self.path / "sweep.toml"
+            if other is None and toml.exists() and toml.read_bytes() != sweep.text.encode():
+                other = toml
+            if other is not None:
                 raise InputError(
-                    f"{other} is of no sweep, and would be replaced; give another --out"
+                    f"{other} is of no sweep that is known here, and would be replaced; give another --out"
                 ) from None
-            write_file(self.path / "sweep.toml", lambda file: file.write(sweep.text.encode()))
+            write_file(toml, lambda file: file.write(sweep.text.encode()))
             write_file(place, lambda file: file.write(json.dumps(now, indent=1).encode()))
             return
         except (OSError, ValueError, RecursionError) as error:

@@ -39,7 +39,7 @@ from impactopt.robots.robot import Robot
 # contact, at most. Loads change no faster than the nodes are apart, and inverse dynamics of every millisecond
 # is slow.
 COARSE_STEP, CONTACT_STEP = 5e-3, 1e-3
-_BETWEEN_NODES = 3  # steps of a coarse reference between two nodes, at least
+_BETWEEN_NODES = 3  # steps of a coarse reference between two nodes, if these are 3 ms apart
 MOMENT_COST = 10.0  # [1/m] weight of a wrench correction's moments relative to its forces
 
 
@@ -441,8 +441,8 @@ class Plan:
 
     @cached_property
     def coarse_reference(self) -> Trajectory:
-        """The servo's reference every `COARSE_STEP`, more often where nodes are nearer, in contact every
-        millisecond; InputError as of `reference`.
+        """The servo's reference every `COARSE_STEP`, or more often if any two nodes are near each other, in
+        contact every millisecond; InputError as of `reference`.
         """
         return self.trajectory(step=self._coarse_step, hold=self._coarse_step)
 
@@ -454,8 +454,9 @@ class Plan:
 
     @property
     def _coarse_step(self) -> float:
-        least = min(piece.spline.duration * float(np.diff(piece.nodes).min()) for piece in self.pieces())
-        return min(COARSE_STEP, least / _BETWEEN_NODES)
+        pieces = self.pieces() + (self.pieces(missed=True) if self.abort is not None else [])
+        least = min(piece.spline.duration * float(np.diff(piece.nodes).min()) for piece in pieces)
+        return max(CONTACT_STEP, min(COARSE_STEP, least / _BETWEEN_NODES))
 
     @cached_property
     def missed_reference(self) -> Trajectory:

@@ -8,6 +8,7 @@ one to random targets. What cannot be drafted is a row, too, with the reason.
 from __future__ import annotations
 
 import re
+import shutil
 import time
 import warnings
 from collections.abc import Iterator, Mapping
@@ -154,6 +155,7 @@ def _row(
     try:
         draft = draft_problem(file, folder=drafts, motion=motion)
         place = file_of(name, drafts)
+        shutil.rmtree(place.with_suffix(""), ignore_errors=True)  # the result of an earlier run
         place.write_text(draft.text, encoding="utf-8")
         out["draft_seconds"] = time.process_time() - began
         problem = read_problem_file(place).build()

@@ -193,12 +193,13 @@ def test_the_same_sweep_goes_on_and_another_is_refused(tmp_path: Path) -> None:
 def test_files_that_a_sweep_would_replace_are_refused(tmp_path: Path) -> None:
     """Others may be beside its own."""
     (tmp_path / "notes.txt").write_text("mine")
-    own = tmp_path / "table.parquet"
-    own.write_text("mine")
-    with pytest.raises(InputError, match=r"table\.parquet is of no sweep, and would be replaced"):
-        Store(sweep(), tmp_path)
-    assert own.read_text() == "mine" and not (tmp_path / "sweep.json").exists()
-    own.unlink()
+    for name in ("table.parquet", "sweep.toml"):
+        own = tmp_path / name
+        own.write_text("mine")
+        with pytest.raises(InputError, match=rf"{name} is of no sweep .*, and would be replaced"):
+            Store(sweep(), tmp_path)
+        assert own.read_text() == "mine" and not (tmp_path / "sweep.json").exists()
+        own.unlink()
     Store(sweep(), tmp_path).close()
 
 

@@ -108,10 +108,11 @@ def read_log(
             f"{name}: no column {SPEED}{did_you_mean(SPEED, columns)}; give it, or joint positions and the "
             f"robot they are of. It has {_listed(columns)}"
         )
-    if SPEED in columns and not any(joint in columns for joint in _joint_columns(robot)):
+    joints = _joint_columns(robot)
+    if SPEED in columns and not any(joint in columns for joint in joints):
         raise InputError(
             f"{name} has {SPEED}, and no joint positions: leave robot (--problem) out, or give the columns "
-            f"{', '.join(_joint_columns(robot))}"
+            f"{', '.join(joints)}"
         )
     travel, mass = _hand(columns, robot, striker, normal, name)
     return ImpactLog(time=time, force=force, travel=travel, model_mass=mass, name=name)

@@ -29,6 +29,7 @@ from impactopt.files.output import record_of, save_record
 from impactopt.files.replay import load_planned, resumed
 from impactopt.planning.lazy_constraints import (
     gear_caution,
+    gears_beyond,
     lazy_terms_of,
     with_lazy_constraints,
 )
@@ -221,3 +222,4 @@ def test_a_replay_that_goes_beyond_is_told(bounded: Solution) -> None:
     assert harder.loads.gear.max() > 1.1 * LIMIT
     text = gear_caution(bounded.problem, [bounded.loads, harder.loads])["gear_caution"]
     assert text.startswith("gear of wrist") and "at most 1.8 allowed" in text
+    assert gears_beyond(bounded.problem, [bounded.loads], more=0.03) == ""
